@@ -1,0 +1,1 @@
+"""Everything between the sites: packet, link, delay injection, round trip and clock offset."""

@@ -1,0 +1,1 @@
+"""The operator's side: its controller, its operators, `python -m local_site`."""

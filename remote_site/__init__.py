@@ -1,0 +1,1 @@
+"""The far side: its controller, its environments, `python -m remote_site`."""

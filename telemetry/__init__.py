@@ -1,0 +1,1 @@
+"""What leaves a site for people: rows, stream, result files, dashboard."""
