@@ -1,0 +1,98 @@
+"""One row a tick: the one record that the stream, result files and the dashboard share."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+RowArray: TypeAlias = npt.NDArray[np.void]
+
+LAYOUT_VERSION: Final = 1
+"""Raised whenever a field of `COLUMNS` is added, removed, moved or changes its meaning."""
+
+NO_PEER_STATE: Final = 255
+"""The `peer_state` of a site that has never heard its peer."""
+
+MAX_JOINTS: Final = 16
+MAX_DIMENSION: Final = 3
+
+
+class TelemetryError(Exception):
+    """Telemetry that cannot be produced, read or shown as asked."""
+
+
+class Column(NamedTuple):
+    """What one field of a row is: its number format, its length, its unit and its meaning."""
+
+    format: str
+    axis: Literal["scalar", "joint", "task"]
+    unit: str
+    meaning: str
+
+
+COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
+    {
+        "sequence": Column("<u8", "scalar", "1", "Rows written by this site before this one"),
+        "stamp_ns": Column("<i8", "scalar", "ns", "Start of the tick on the site's own clock"),
+        "time_ns": Column("<i8", "scalar", "ns", "Start of the tick since the session started"),
+        "lateness_ns": Column("<i8", "scalar", "ns", "Wake-up after the tick's deadline"),
+        "duration_ns": Column("<i8", "scalar", "ns", "Computing time of the previous tick"),
+        "state": Column("u1", "scalar", "1", "Supervisor state of this site"),
+        "peer_state": Column("u1", "scalar", "1", "Supervisor state of the peer; 255: none heard"),
+        "cut": Column("<u2", "scalar", "1", "Limits the guard applied in this tick, one bit each"),
+        "q": Column("<f8", "joint", "rad", "Joint angles"),
+        "q_dot": Column("<f8", "joint", "rad/s", "Joint speeds"),
+        "torque_nm": Column("<f8", "joint", "N·m", "Joint torques written to the device"),
+        "position_m": Column("<f8", "task", "m", "End-effector position X"),
+        "velocity_m_s": Column("<f8", "task", "m/s", "End-effector velocity"),
+        "external_force_n": Column(
+            "<f8", "task", "N", "Force of the hand or the environment on the robot"
+        ),
+        "coupling_force_n": Column("<f8", "task", "N", "Force −ΩP(e) of the coupling on the robot"),
+        "peer_position_m": Column(
+            "<f8", "task", "m", "Delayed position of the peer in use; NaN: none"
+        ),
+        "one_way_delay_s": Column(
+            "<f8", "scalar", "s", "Age of the peer sample in use, from the clock offset; NaN: none"
+        ),
+        "round_trip_s": Column(
+            "<f8", "scalar", "s", "Age of the whole loop, measured on one clock; NaN: none"
+        ),
+        "certified_round_trip_s": Column(
+            "<f8", "scalar", "s", "Round trip the gains in use are proven stable for"
+        ),
+        "manipulability": Column("<f8", "scalar", "m^(2z)", "det(J Jᵀ); zero at a singular pose"),
+        "link_distance_m": Column(
+            "<f8", "scalar", "m", "Smallest distance of the links to an obstacle; NaN: no obstacle"
+        ),
+        "midpoint_distance_m": Column(
+            "<f8", "scalar", "m", "Smallest distance of a link's midpoint to one; NaN: no obstacle"
+        ),
+        "sub_task_error_rad_s": Column(
+            "<f8", "scalar", "rad/s", "Norm of the sub-task error in the null space"
+        ),
+        "lost": Column("<u4", "scalar", "1", "Packets of the peer that never came, so far"),
+        "late": Column("<u4", "scalar", "1", "Packets of the peer that came too late, so far"),
+        "rejected": Column("<u4", "scalar", "1", "Packets refused as invalid or foreign, so far"),
+        "missed": Column("<u4", "scalar", "1", "Ticks skipped because the loop was late, so far"),
+    }
+)
+
+
+def row_dtype(joints: int, dimension: int) -> np.dtype[np.void]:
+    """Dtype of one row of a site with this many joints and task dimensions.
+
+    Packed and little-endian, in the order of `COLUMNS`. TelemetryError outside 1..16 joints or
+    1..3 dimensions.
+    """
+    if not 1 <= joints <= MAX_JOINTS:
+        raise TelemetryError(f"{joints} joints; rows hold 1 to {MAX_JOINTS}")
+    if not 1 <= dimension <= MAX_DIMENSION:
+        raise TelemetryError(f"{dimension} task dimensions; rows hold 1 to {MAX_DIMENSION}")
+    length = {"joint": (joints,), "task": (dimension,)}
+    fields: list[Any] = [
+        (name, column.format, length.get(column.axis, ())) for name, column in COLUMNS.items()
+    ]
+    return np.dtype(fields)

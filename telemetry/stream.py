@@ -1,0 +1,245 @@
+"""From the control loop to the wire and back: a ring of rows, published in batches."""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from telemetry.rows import LAYOUT_VERSION, RowArray, TelemetryError, row_dtype
+
+FloatArray = npt.NDArray[np.float64]
+
+MAGIC: Final = b"FHTB"
+MAX_BATCH_ROWS: Final = 10_000
+RING_BATCHES: Final = 80
+
+# magic, layout version, site, joints, dimension, rows, session digest, epoch, first sequence
+_HEADER: Final = struct.Struct("<4sBBBBIQQQ")
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Consecutive rows of one site; `rows` is read-only, of dtype `row_dtype(joints, dimension)`.
+
+    `epoch` tells one run of a site from the next; `digest` is that of the session file.
+    """
+
+    site: int
+    joints: int
+    dimension: int
+    digest: int
+    epoch: int
+    rows: RowArray
+
+
+class TelemetryStream:
+    """The producer's side: `put` in the tick, `flush` in the slack after it, one thread.
+
+    A ring of 80 batches of rows is allocated once; `publish` gets each full batch as bytes and must
+    not block. Rows overwritten before they were flushed are lost and counted.
+    """
+
+    def __init__(
+        self,
+        joints: int,
+        dimension: int,
+        site: int,
+        session_digest: int,
+        epoch: int,
+        publish: Callable[[bytes], None],
+        batch_rows: int = 50,
+    ) -> None:
+        if not 1 <= batch_rows <= MAX_BATCH_ROWS:
+            raise TelemetryError(f"batches of {batch_rows} rows; use 1 to {MAX_BATCH_ROWS}")
+        if site not in (0, 1):
+            raise TelemetryError(f"site {site}; use 0 (local) or 1 (remote)")
+        for name, number in (("session digest", session_digest), ("epoch", epoch)):
+            if not 0 <= number < 2**64:
+                raise TelemetryError(f"{name} {number} does not fit into 64 bits")
+        self._shape = (site, joints, dimension)
+        self._session = (session_digest, epoch)
+        self._publish = publish
+        self._batch_rows = batch_rows
+        # A whole number of batches, so that a full batch is always one piece of memory.
+        self._capacity = RING_BATCHES * batch_rows
+        self._count = 0
+        self._flushed = 0
+        self._dropped = 0
+        ring = np.zeros(self._capacity, row_dtype(joints, dimension))
+        self._ring = ring
+        # A view a field: assigning by view costs a quarter of assigning by field name.
+        self._sequence = ring["sequence"]
+        self._stamp_ns = ring["stamp_ns"]
+        self._time_ns = ring["time_ns"]
+        self._lateness_ns = ring["lateness_ns"]
+        self._duration_ns = ring["duration_ns"]
+        self._state = ring["state"]
+        self._peer_state = ring["peer_state"]
+        self._cut = ring["cut"]
+        self._q = ring["q"]
+        self._q_dot = ring["q_dot"]
+        self._torque_nm = ring["torque_nm"]
+        self._position_m = ring["position_m"]
+        self._velocity_m_s = ring["velocity_m_s"]
+        self._external_force_n = ring["external_force_n"]
+        self._coupling_force_n = ring["coupling_force_n"]
+        self._peer_position_m = ring["peer_position_m"]
+        self._one_way_delay_s = ring["one_way_delay_s"]
+        self._round_trip_s = ring["round_trip_s"]
+        self._certified_round_trip_s = ring["certified_round_trip_s"]
+        self._manipulability = ring["manipulability"]
+        self._link_distance_m = ring["link_distance_m"]
+        self._midpoint_distance_m = ring["midpoint_distance_m"]
+        self._sub_task_error_rad_s = ring["sub_task_error_rad_s"]
+        self._lost = ring["lost"]
+        self._late = ring["late"]
+        self._rejected = ring["rejected"]
+        self._missed = ring["missed"]
+
+    @property
+    def count(self) -> int:
+        """Rows put so far; the sequence of the next row."""
+        return self._count
+
+    @property
+    def dropped_rows(self) -> int:
+        """Rows that were overwritten before `flush` was called often enough."""
+        return self._dropped
+
+    def put(
+        self,
+        *,
+        stamp_ns: int,
+        time_ns: int,
+        lateness_ns: int,
+        duration_ns: int,
+        state: int,
+        peer_state: int,
+        cut: int,
+        q: FloatArray,
+        q_dot: FloatArray,
+        torque_nm: FloatArray,
+        position_m: FloatArray,
+        velocity_m_s: FloatArray,
+        external_force_n: FloatArray,
+        coupling_force_n: FloatArray,
+        peer_position_m: FloatArray | float,
+        one_way_delay_s: float,
+        round_trip_s: float,
+        certified_round_trip_s: float,
+        manipulability: float,
+        link_distance_m: float,
+        midpoint_distance_m: float,
+        sub_task_error_rad_s: float,
+        lost: int,
+        late: int,
+        rejected: int,
+        missed: int,
+    ) -> None:
+        """Write one row into the ring; real-time safe. Fields as in `COLUMNS`.
+
+        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A row whose
+        assignment raises (a wrong shape) is not counted.
+        """
+        i = self._count % self._capacity
+        self._sequence[i] = self._count
+        self._stamp_ns[i] = stamp_ns
+        self._time_ns[i] = time_ns
+        self._lateness_ns[i] = lateness_ns
+        self._duration_ns[i] = duration_ns
+        self._state[i] = state
+        self._peer_state[i] = peer_state
+        self._cut[i] = cut
+        self._q[i] = q
+        self._q_dot[i] = q_dot
+        self._torque_nm[i] = torque_nm
+        self._position_m[i] = position_m
+        self._velocity_m_s[i] = velocity_m_s
+        self._external_force_n[i] = external_force_n
+        self._coupling_force_n[i] = coupling_force_n
+        self._peer_position_m[i] = peer_position_m
+        self._one_way_delay_s[i] = one_way_delay_s
+        self._round_trip_s[i] = round_trip_s
+        self._certified_round_trip_s[i] = certified_round_trip_s
+        self._manipulability[i] = manipulability
+        self._link_distance_m[i] = link_distance_m
+        self._midpoint_distance_m[i] = midpoint_distance_m
+        self._sub_task_error_rad_s[i] = sub_task_error_rad_s
+        self._lost[i] = lost
+        self._late[i] = late
+        self._rejected[i] = rejected
+        self._missed[i] = missed
+        self._count += 1
+
+    def flush(self) -> None:
+        """Publish every full batch not yet published; nothing to do in most ticks."""
+        self._forget_overwritten()
+        while self._count // self._batch_rows > self._flushed // self._batch_rows:
+            self._publish_batch()
+
+    def drain(self) -> None:
+        """Publish all that is left, the last batch full or not; for the end of a session."""
+        self._forget_overwritten()
+        while self._count > self._flushed:
+            self._publish_batch()
+
+    def last(self, rows: int) -> RowArray:
+        """Copy of the newest rows, oldest first; fewer if fewer are held."""
+        end = self._count
+        start = max(end - max(rows, 0), end - self._capacity, 0)
+        return self._ring[np.arange(start, end) % self._capacity]
+
+    def _forget_overwritten(self) -> None:
+        oldest = self._count - self._capacity
+        if self._flushed < oldest:
+            self._dropped += oldest - self._flushed
+            self._flushed = oldest
+
+    def _publish_batch(self) -> None:
+        # Up to the next multiple of the batch size, so never across the ring's end.
+        rows = min(self._batch_rows - self._flushed % self._batch_rows, self._count - self._flushed)
+        start = self._flushed % self._capacity
+        header = _HEADER.pack(
+            MAGIC, LAYOUT_VERSION, *self._shape, rows, *self._session, self._flushed
+        )
+        self._flushed += rows
+        self._publish(header + self._ring[start : start + rows].tobytes())
+
+
+def decode_batch(payload: bytes) -> Batch:
+    """Read one published batch; TelemetryError for anything a `TelemetryStream` does not write.
+
+    Whether its digest and epoch are those expected is for the caller to judge.
+    """
+    if len(payload) < _HEADER.size:
+        raise TelemetryError(f"{len(payload)} bytes; a batch has a header of {_HEADER.size}")
+    magic, version, site, joints, dimension, count, digest, epoch, first = _HEADER.unpack_from(
+        payload
+    )
+    if magic != MAGIC:
+        raise TelemetryError(f"starts with {magic!r}, not {MAGIC!r}: not a telemetry batch")
+    if version != LAYOUT_VERSION:
+        raise TelemetryError(
+            f"layout version {version}, this program reads {LAYOUT_VERSION}: "
+            "run the same version of farhand everywhere"
+        )
+    if site not in (0, 1):
+        raise TelemetryError(f"site {site}, expected 0 (local) or 1 (remote)")
+    if not 1 <= count <= MAX_BATCH_ROWS:
+        raise TelemetryError(f"{count} rows, expected 1 to {MAX_BATCH_ROWS}")
+    dtype = row_dtype(joints, dimension)
+    expected = _HEADER.size + count * dtype.itemsize
+    if len(payload) != expected:
+        raise TelemetryError(
+            f"{len(payload)} bytes, but {count} rows of {joints} joints and {dimension} task "
+            f"dimensions take {expected}"
+        )
+    rows: RowArray = np.frombuffer(payload, dtype, offset=_HEADER.size)
+    if first + count > 2**64 or not np.array_equal(
+        rows["sequence"], np.uint64(first) + np.arange(count, dtype=np.uint64)
+    ):
+        raise TelemetryError(f"rows are not numbered consecutively from {first}")
+    return Batch(site, joints, dimension, digest, epoch, rows)
