@@ -1,0 +1,51 @@
+"""The remote robot's law: (4)–(6) with a sub-task in the null space of its Jacobian."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from control_law.control import control_torque
+from control_law.coupling import Coupling
+from control_law.damping import Damping
+from control_law.null_space import null_space_velocity, project
+from control_law.ramp import smooth_ramp
+from control_law.sub_tasks.sub_task import SubTask
+from hardware.robot_model import RobotTerms
+from site_runtime.controller import Command
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteController:
+    """nP+D with gravity compensation; Ω and the sub-task ramp in after engagement [s]."""
+
+    coupling: Coupling
+    damping: Damping
+    ramp_s: float
+    sub_task: SubTask | None
+    sub_task_ramp_s: float
+    regularisation: float
+
+    def step(self, terms: RobotTerms, peer_position_m: FloatArray, engaged_s: float) -> Command:
+        """Return the torque toward the local robot's delayed position (z,) [m]."""
+        share, _ = smooth_ramp(engaged_s, self.ramp_s)
+        force = share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_r)
+        if self.sub_task is None:
+            zeta = zeta_dot = np.zeros_like(terms.q)
+        else:
+            zeta, zeta_dot = self._reference(self.sub_task, terms, engaged_s)
+        torque, s = control_torque(terms, force, self.damping, zeta, zeta_dot)  # (6)
+        error = project(terms.J, s, self.regularisation) if self.sub_task is not None else None
+        return Command(torque, -force, 0.0 if error is None else float(np.sqrt(error @ error)))
+
+    def _reference(
+        self, sub_task: SubTask, terms: RobotTerms, engaged_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """ζ and ζ̇ of (4), the sub-task's gradient ramped in."""
+        ramp, ramp_rate = smooth_ramp(engaged_s, self.sub_task_ramp_s)
+        g, g_dot = sub_task.evaluate(terms)
+        return null_space_velocity(
+            terms.J, terms.J_dot, ramp * g, ramp * g_dot + ramp_rate * g, self.regularisation
+        )

@@ -1,0 +1,76 @@
+"""What every command passes before it reaches a device. Whatever is cut is reported."""
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class GuardError(Exception):
+    """A command that cannot be mended by cutting: the site goes to FAULT."""
+
+
+class Cut(IntFlag):
+    """What the guard cut in one tick."""
+
+    NONE = 0
+    TORQUE = 1
+    VELOCITY = 2
+    WORKSPACE = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Per-joint torque [N·m] and velocity [rad/s], (n,); workspace box [m], (z,)."""
+
+    torque_nm: FloatArray
+    velocity_rad_s: FloatArray
+    workspace_min_m: FloatArray
+    workspace_max_m: FloatArray
+
+
+class Guard:
+    """Limits on the point to follow and on the torque; `cut` tells what this tick lost."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self.cut = Cut.NONE
+        self.counts = {Cut.TORQUE: 0, Cut.VELOCITY: 0, Cut.WORKSPACE: 0}
+
+    def target(self, position_m: FloatArray) -> FloatArray:
+        """Return the nearest point of the workspace box to the peer's point, (z,)."""
+        self.cut = Cut.NONE
+        limited = np.clip(position_m, self._limits.workspace_min_m, self._limits.workspace_max_m)
+        if (limited != position_m).any():
+            self._count(Cut.WORKSPACE)
+        return limited
+
+    def torque(
+        self, torque_nm: FloatArray, velocity_rad_s: FloatArray, gravity_nm: FloatArray
+    ) -> FloatArray:
+        """Return a torque within limits, (n,).
+
+        A joint faster than its limit keeps its gravity torque but nothing that speeds it up.
+        Raises GuardError on a non-finite value.
+        """
+        if not np.isfinite(torque_nm).all():
+            raise GuardError(f"commanded torque {torque_nm} N·m is not finite")
+        limits = self._limits
+        limited = torque_nm
+        too_fast = np.abs(velocity_rad_s) > limits.velocity_rad_s
+        if too_fast.any():
+            speeding_up = too_fast & ((torque_nm - gravity_nm) * velocity_rad_s > 0.0)
+            if speeding_up.any():
+                limited = np.where(speeding_up, gravity_nm, limited)
+                self._count(Cut.VELOCITY)
+        if (np.abs(limited) > limits.torque_nm).any():
+            limited = np.clip(limited, -limits.torque_nm, limits.torque_nm)
+            self._count(Cut.TORQUE)
+        return limited
+
+    def _count(self, cut: Cut) -> None:
+        self.cut |= cut
+        self.counts[cut] += 1

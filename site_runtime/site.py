@@ -1,0 +1,205 @@
+"""One site: its tick, and the run that carries it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+import numpy.typing as npt
+
+from channel.channel import Channel, PeerSample
+from control_law.null_space import manipulability
+from control_law.obstacle_distance import midpoint_distance, segment_distance
+from hardware.interface import Device, DeviceState
+from hardware.robot_model import RobotModel, RobotTerms
+from site_runtime.clock import Clock, LatenessHistogram, Pacer
+from site_runtime.controller import Command, Controller
+from site_runtime.guard import Guard
+from site_runtime.keys import SiteId
+from site_runtime.supervisor import DRIVEN, State, Supervisor
+from telemetry.stream import TelemetryStream
+
+FloatArray = npt.NDArray[np.float64]
+_NO_PEER_STATE = 255
+_FAREWELL_PACKETS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class SiteTimes:
+    """Tick period and the instant of session time zero, on the site's clock [ns]."""
+
+    period_ns: int
+    session_start_ns: int
+
+
+class Site:
+    """Device, channel, controller, supervisor and guard of one side of the teleoperation.
+
+    The same object runs in a daemon on a steady clock and in simulation on a manual one.
+    `certified_round_trip_s` is what the gains are proven for, `obstacles_m` (k,3) are centres.
+    """
+
+    def __init__(
+        self,
+        identity: SiteId,
+        *,
+        device: Device,
+        robot: RobotModel,
+        channel: Channel,
+        controller: Controller,
+        supervisor: Supervisor,
+        guard: Guard,
+        telemetry: TelemetryStream,
+        clock: Clock,
+        times: SiteTimes,
+        certified_round_trip_s: float,
+        obstacles_m: FloatArray,
+    ) -> None:
+        self.identity = identity
+        self.channel = channel
+        self.guard = guard
+        self.telemetry = telemetry
+        self.lateness = LatenessHistogram()
+        self.certified_round_trip_s = certified_round_trip_s
+        self.failure: Exception | None = None
+        self.ticks = 0
+        self.missed = 0
+        self.round_trip_s = nan
+        self.error_m = nan
+        self._device = device
+        self._robot = robot
+        self._controller = controller
+        self._supervisor = supervisor
+        self._clock = clock
+        self._times = times
+        self._obstacles_m = obstacles_m
+        self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
+        self._duration_ns = 0
+        self._position_m = np.zeros(robot.task_dimension)
+
+    @property
+    def state(self) -> State:
+        """The supervisor's state."""
+        return self._supervisor.state
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Tick at absolute deadlines until told to stop; the robot is stopped however it ends."""
+        self.open()
+        try:
+            pacer = Pacer(self._clock, self._times.period_ns)
+            while not should_stop():
+                lateness_ns = pacer.wait()
+                self.lateness.add(lateness_ns)
+                self.missed = pacer.missed
+                self.tick(lateness_ns)
+                self.telemetry.flush()
+        finally:
+            self.close()
+
+    def open(self) -> None:
+        """Open the device; its outputs stay off until the peer is there."""
+        self._device.open()
+
+    def tick(self, lateness_ns: int = 0) -> None:
+        """One tick. Whatever goes wrong ends in the device's stop, which never raises."""
+        now_ns = self._clock.now_ns()
+        if self.failure is not None:
+            self._tick_in_fault(now_ns)
+            return
+        try:
+            reading = self._device.read()
+            peer = self.channel.latest(now_ns)
+            terms = self._robot.terms(reading.position_rad, reading.velocity_rad_s)
+            state, command, torque_nm = self._supervise(now_ns, peer), self._idle, None
+            if state in DRIVEN and self._supervisor.target_m is not None:
+                target_m = self.guard.target(self._supervisor.target_m)
+                command = self._controller.step(terms, target_m, self._supervisor.engaged_s(now_ns))
+                torque_nm = self.guard.torque(command.torque_nm, terms.q_dot, terms.G)
+                self._device.write(torque_nm)
+            force_n = reading.wrench[: self._robot.task_dimension]
+            self.channel.send(now_ns, state, terms.X, terms.X_dot, force_n)
+            self._put(now_ns, lateness_ns, reading, peer, terms, command, torque_nm)
+        except Exception as failure:
+            self._device.stop()
+            self._supervisor.fault()
+            self.failure = failure
+        self.ticks += 1
+        self._duration_ns = self._clock.now_ns() - now_ns
+
+    def close(self) -> None:
+        """Stop the robot, tell the peer, close the device. Never raises before the stop."""
+        self._device.stop()
+        self._supervisor.stop()
+        for packet in range(_FAREWELL_PACKETS):
+            self._say(self._clock.now_ns() + packet * self._times.period_ns)
+        self.telemetry.drain()
+        self._device.close()
+
+    def _supervise(self, now_ns: int, peer: PeerSample | None) -> State:
+        """Update the supervisor; switch the outputs on when it first engages."""
+        before = self._supervisor.state
+        state = self._supervisor.update(now_ns, self.channel, peer)
+        if state in DRIVEN and before not in DRIVEN:
+            self._device.enable()
+        return state
+
+    def _tick_in_fault(self, now_ns: int) -> None:
+        """Keep telling the peer and people that this site has failed; the device is stopped."""
+        self.channel.latest(now_ns)
+        self._say(now_ns)
+        self.ticks += 1
+
+    def _say(self, now_ns: int) -> None:
+        rest = np.zeros(self._robot.task_dimension)
+        self.channel.send(now_ns, self._supervisor.state, self._position_m, rest, rest)
+
+    def _put(
+        self,
+        now_ns: int,
+        lateness_ns: int,
+        reading: DeviceState,
+        peer: PeerSample | None,
+        terms: RobotTerms,
+        command: Command,
+        torque_nm: FloatArray | None,
+    ) -> None:
+        """Write this tick's row."""
+        self._position_m = terms.X
+        target_m = self._supervisor.target_m
+        if peer is not None and peer.round_trip_ns is not None:
+            self.round_trip_s = peer.round_trip_ns * 1e-9
+        counters = self.channel.counters
+        self.telemetry.put(
+            stamp_ns=now_ns,
+            time_ns=now_ns - self._times.session_start_ns,
+            lateness_ns=lateness_ns,
+            duration_ns=self._duration_ns,
+            state=self._supervisor.state,
+            peer_state=_NO_PEER_STATE if peer is None else peer.state,
+            cut=self.guard.cut,
+            q=terms.q,
+            q_dot=terms.q_dot,
+            torque_nm=command.torque_nm if torque_nm is None else torque_nm,
+            position_m=terms.X,
+            velocity_m_s=terms.X_dot,
+            external_force_n=reading.wrench[: self._robot.task_dimension],
+            coupling_force_n=command.coupling_force_n,
+            peer_position_m=nan if target_m is None else target_m,
+            one_way_delay_s=nan if peer is None else peer.age_ns * 1e-9,
+            round_trip_s=self.round_trip_s if peer is not None else nan,
+            certified_round_trip_s=self.certified_round_trip_s,
+            manipulability=manipulability(terms.J),
+            link_distance_m=self._nearest(segment_distance, terms.origins),
+            midpoint_distance_m=self._nearest(midpoint_distance, terms.origins),
+            sub_task_error_rad_s=command.sub_task_error_rad_s,
+            lost=counters.lost,
+            late=counters.late,
+            rejected=counters.rejected_total,
+            missed=self.missed,
+        )
+
+    def _nearest(
+        self, distance: Callable[[FloatArray, FloatArray], float], origins_m: FloatArray
+    ) -> float:
+        """Smallest distance of the links to an obstacle [m], NaN without one."""
+        return min((distance(origins_m, centre) for centre in self._obstacles_m), default=nan)
