@@ -1,0 +1,107 @@
+"""What every device is to the rest of farhand: its state, its lifecycle, its errors.
+
+Errors::
+
+    HardwareError
+    ├── DeviceError                 at run time: stop, and look at the machine
+    └── DeviceConfigurationError    before anything moves: the session file or the installation is wrong
+"""
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class HardwareError(Exception):
+    """Anything this package raises on purpose."""
+
+
+class DeviceError(HardwareError):
+    """A device failed, or was used out of order, at run time."""
+
+
+class DeviceConfigurationError(HardwareError, ValueError):
+    """Settings, a robot description or an installation that cannot work.
+
+    Also a `ValueError`, so that a schema validator reports it with the place in the file.
+    """
+
+
+def nearest_names(name: str, valid: Iterable[str]) -> str:
+    """Return the valid names closest to a mistyped one, or all of them, for an error message."""
+    names = sorted(set(valid))
+    return ", ".join(difflib.get_close_matches(name, names, n=5, cutoff=0.5) or names)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """One reading of a device.
+
+    `wrench` (6,) [N, N·m] is what the hand or the environment exerts ON the robot at the end
+    effector, in base axes; `stamp_ns` is on the site's monotonic clock.
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    wrench: FloatArray
+    stamp_ns: int
+
+
+class Device(Protocol):
+    """A robot with torque-controlled joints: open → read* → enable → (read, write)* → stop → close.
+
+    `stop` leads back to the state after `open`, so `enable` may follow; a closed device may be
+    opened again. `read` and `write` are real-time safe; the others may block.
+    """
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        ...
+
+    def open(self) -> None:
+        """Connect, outputs off; raises DeviceError, also when the device is already open."""
+        ...
+
+    def enable(self) -> None:
+        """Switch the outputs on at zero torque; raises DeviceError when the device is not open."""
+        ...
+
+    def read(self) -> DeviceState:
+        """Return the newest state; real-time safe; raises DeviceError."""
+        ...
+
+    def write(self, torque_nm: FloatArray) -> None:
+        """Command joint torques (n,) [N·m]; real-time safe.
+
+        Raises DeviceError, leaving the previous command, when the outputs are off, the shape is
+        wrong or a value is not finite.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Zero the torque and switch the outputs off; never raises, idempotent, valid at any time."""
+        ...
+
+    def close(self) -> None:
+        """Stop, then disconnect; idempotent."""
+        ...
+
+
+class ContactForce(Protocol):
+    """Force of an operator or an environment on the end effector of a simulated device."""
+
+    def force_n(
+        self, time_s: float, position_m: FloatArray, velocity_m_s: FloatArray
+    ) -> FloatArray:
+        """Return the force (z,) [N] on the robot at session time `time_s`, in base axes.
+
+        Must depend on its arguments only: an integrator calls it several times a step.
+        """
+        ...

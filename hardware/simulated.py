@@ -1,0 +1,292 @@
+"""A simulated arm: rigid-body dynamics advanced to the site's clock at every read."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hardware.interface import (
+    ContactForce,
+    DeviceConfigurationError,
+    DeviceError,
+    DeviceState,
+    FloatArray,
+)
+from hardware.registry import DeviceContext, DriverEntry
+from hardware.robot_model import RobotModel
+
+MAX_CATCH_UP_NS = 50_000_000
+DIVERGED_RAD_S = 1e4  # no arm moves so; beyond it the numbers are the integrator's, soon infinite
+FRICTION_SWEEPS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedSettings:
+    """Settings of the driver "simulated": integrator, imperfections, brakes.
+
+    `step_s` is the longest integration step. `encoder_resolution_rad` > 0 quantises the position
+    and replaces the exact velocity by its backward difference through a first-order filter of time
+    constant `velocity_filter_s`. Friction and `torque_limit_nm` hold for each joint; noise is
+    Gaussian, one standard deviation. With `brakes` the arm stands still while outputs are off.
+    """
+
+    initial_position_rad: tuple[float, ...]
+    driver: Literal["simulated"] = "simulated"
+    integrator: Literal["semi-implicit", "rk4"] = "semi-implicit"
+    step_s: float = 0.001
+    encoder_resolution_rad: float = 0.0
+    velocity_filter_s: float = 0.0038
+    coulomb_friction_nm: float = 0.0
+    viscous_friction_nm_s: float = 0.0
+    torque_limit_nm: float | None = None
+    velocity_noise_rad_s: float = 0.0
+    force_noise_n: float = 0.0
+    brakes: bool = True
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(angle) for angle in self.initial_position_rad):
+            raise DeviceConfigurationError(
+                f"initial_position_rad is {self.initial_position_rad}; every angle must be finite"
+            )
+        if not 1e-6 <= self.step_s <= MAX_CATCH_UP_NS * 1e-9:
+            raise DeviceConfigurationError(
+                f"step_s is {self.step_s}; choose between 1e-6 and {MAX_CATCH_UP_NS * 1e-9:g} s"
+            )
+        for name in (
+            "encoder_resolution_rad",
+            "velocity_filter_s",
+            "coulomb_friction_nm",
+            "viscous_friction_nm_s",
+            "velocity_noise_rad_s",
+            "force_noise_n",
+        ):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise DeviceConfigurationError(f"{name} is {value}; it must be zero or positive")
+        if self.torque_limit_nm is not None and not self.torque_limit_nm > 0.0:
+            raise DeviceConfigurationError(
+                f"torque_limit_nm is {self.torque_limit_nm}; it must be positive, or left out"
+            )
+
+
+class SimulatedDevice:
+    """An arm that obeys M q̈ + C q̇ + G = τ + JᵀF and the given imperfections; a `Device`.
+
+    `read` integrates from the previous reading to now with the last torque held, at most 50 ms of
+    it: time beyond is not simulated and adds to `skipped_ns`. One clock step of exactly `step_s`
+    is one integration step, so a manual clock makes runs equal bit for bit. Joints have no stops.
+    """
+
+    def __init__(
+        self,
+        model: RobotModel,
+        settings: SimulatedSettings,
+        contact: ContactForce | None,
+        now_ns: Callable[[], int],
+        session_start_ns: int,
+        seed: int,
+    ) -> None:
+        if len(settings.initial_position_rad) != model.joints:
+            raise DeviceConfigurationError(
+                f"initial_position_rad has {len(settings.initial_position_rad)} angles, the robot "
+                f"has {model.joints} joints"
+            )
+        self.skipped_ns = 0
+        self._model = model
+        self._settings = settings
+        self._contact = contact
+        self._now_ns = now_ns
+        self._session_start_ns = session_start_ns
+        self._seed = seed
+        self._step_ns = round(settings.step_s * 1e9)
+        self._step = self._step_rk4 if settings.integrator == "rk4" else self._step_semi_implicit
+        self._opened = False
+        self._enabled = False
+        self._reset()
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self._model.joints
+
+    def open(self) -> None:
+        """Put the arm at its initial position, at rest."""
+        if self._opened:
+            raise DeviceError("the simulated device is already open; close it first")
+        self._reset()
+        self._last_ns = self._now_ns()
+        self._opened = True
+
+    def enable(self) -> None:
+        """Switch the outputs on, at zero torque."""
+        self._require_open()
+        self._advance(self._now_ns())  # what has passed until here passed with the outputs off
+        self._torque = np.zeros(self.joints)
+        self._enabled = True
+
+    def read(self) -> DeviceState:
+        """Simulate up to now and return the measured state."""
+        self._require_open()
+        now_ns = self._now_ns()
+        elapsed_ns = now_ns - self._last_ns
+        self._advance(now_ns)
+        position, velocity = self._measure(elapsed_ns)
+        wrench = np.zeros(6)
+        if self._contact is not None:
+            X, X_dot, _ = self._model.end_effector(self._q, self._q_dot)
+            wrench[: len(X)] = self._contact.force_n(self._session_s(now_ns), X, X_dot)
+        if self._settings.force_noise_n > 0.0:
+            z = self._model.task_dimension
+            wrench[:z] += self._settings.force_noise_n * self._random.standard_normal(z)
+        return DeviceState(position, velocity, wrench, now_ns)
+
+    def write(self, torque_nm: FloatArray) -> None:
+        """Hold these joint torques from the last reading on, within the actuator's limit."""
+        if not self._enabled:
+            raise DeviceError("torque refused: the outputs are off; call enable() first")
+        if torque_nm.shape != (self.joints,):
+            raise DeviceError(f"torque refused: shape {torque_nm.shape}, not ({self.joints},)")
+        if not np.isfinite(torque_nm).all():
+            raise DeviceError(f"torque refused: {torque_nm} N·m is not finite")
+        limit = self._settings.torque_limit_nm
+        self._torque = torque_nm.copy() if limit is None else np.clip(torque_nm, -limit, limit)
+
+    def stop(self) -> None:
+        """Zero the torque, switch the outputs off and let the brakes fall in."""
+        self._enabled = False
+        self._torque = np.zeros(self.joints)
+        if self._settings.brakes:
+            self._q_dot = np.zeros(self.joints)
+
+    def close(self) -> None:
+        """Stop and let go of the arm."""
+        self.stop()
+        self._opened = False
+
+    def _reset(self) -> None:
+        self._q = np.array(self._settings.initial_position_rad)
+        self._q_dot = np.zeros(self.joints)
+        self._torque = np.zeros(self.joints)
+        self._encoder_rad: FloatArray | None = None
+        self._filtered_rad_s = np.zeros(self.joints)
+        self._random = np.random.default_rng(self._seed)
+
+    def _require_open(self) -> None:
+        if not self._opened:
+            raise DeviceError("the simulated device is not open; call open() first")
+
+    def _session_s(self, now_ns: int) -> float:
+        return (now_ns - self._session_start_ns) / 1e9
+
+    def _advance(self, now_ns: int) -> None:
+        elapsed_ns = now_ns - self._last_ns
+        self._last_ns = now_ns
+        if elapsed_ns <= 0 or (self._settings.brakes and not self._enabled):
+            return
+        if elapsed_ns > MAX_CATCH_UP_NS:
+            self.skipped_ns += elapsed_ns - MAX_CATCH_UP_NS
+            elapsed_ns = MAX_CATCH_UP_NS
+        steps = -(-elapsed_ns // self._step_ns)
+        step_s = elapsed_ns / (steps * 1e9)
+        start_s = self._session_s(now_ns - elapsed_ns)
+        for step in range(steps):
+            self._step(start_s + step * step_s, step_s)
+            # Written so that a NaN too counts as diverged.
+            if not np.abs(self._q_dot).max() < DIVERGED_RAD_S:
+                raise DeviceError(
+                    f"the simulation diverged at {start_s:.3f} s: joint velocity {self._q_dot} "
+                    f"rad/s; lower the gains or step_s (now {self._settings.step_s} s)"
+                )
+
+    def _acceleration(
+        self, time_s: float, q: FloatArray, q_dot: FloatArray, torque: FloatArray
+    ) -> FloatArray:
+        torque = torque - self._settings.viscous_friction_nm_s * q_dot
+        if self._contact is not None:
+            X, X_dot, J = self._model.end_effector(q, q_dot)
+            torque += J.T @ self._contact.force_n(time_s, X, X_dot)
+        return self._model.forward_dynamics(q, q_dot, torque)
+
+    def _step_semi_implicit(self, time_s: float, step_s: float) -> None:
+        acceleration = self._acceleration(time_s, self._q, self._q_dot, self._torque)
+        if self._settings.coulomb_friction_nm > 0.0:
+            acceleration += self._coulomb_friction(acceleration, step_s)[1]
+        self._q_dot = self._q_dot + step_s * acceleration
+        self._q = self._q + step_s * self._q_dot
+
+    def _step_rk4(self, time_s: float, step_s: float) -> None:
+        q, v, torque = self._q, self._q_dot, self._torque
+        a1 = self._acceleration(time_s, q, v, torque)
+        if self._settings.coulomb_friction_nm > 0.0:
+            friction, change = self._coulomb_friction(a1, step_s)
+            a1 += change
+            torque = torque + friction
+        half_s = 0.5 * step_s
+        v2 = v + half_s * a1
+        a2 = self._acceleration(time_s + half_s, q + half_s * v, v2, torque)
+        v3 = v + half_s * a2
+        a3 = self._acceleration(time_s + half_s, q + half_s * v2, v3, torque)
+        v4 = v + step_s * a3
+        a4 = self._acceleration(time_s + step_s, q + step_s * v3, v4, torque)
+        self._q = q + step_s / 6.0 * (v + 2.0 * (v2 + v3) + v4)
+        self._q_dot = v + step_s / 6.0 * (a1 + 2.0 * (a2 + a3) + a4)
+
+    def _coulomb_friction(
+        self, acceleration: FloatArray, step_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the friction torque of one step and the acceleration it adds.
+
+        The torque within ±limit that leaves the least kinetic energy ½vᵀMv after the step, found
+        joint by joint (projected Gauss–Seidel from zero). Every sweep lowers that energy, so
+        friction can hold a joint still but neither chatter nor drive it.
+        """
+        limit_nm = self._settings.coulomb_friction_nm
+        inverse_inertia = self._model.inverse_inertia(self._q)
+        free_velocity = self._q_dot + step_s * acceleration
+        friction = np.zeros(self.joints)
+        for _ in range(FRICTION_SWEEPS):
+            largest_change = 0.0
+            for joint in range(self.joints):
+                row = inverse_inertia[joint]
+                velocity = free_velocity[joint] + step_s * (row @ friction)
+                previous = friction[joint]
+                stopping = previous - velocity / (step_s * row[joint])
+                friction[joint] = min(max(stopping, -limit_nm), limit_nm)
+                largest_change = max(largest_change, abs(friction[joint] - previous))
+            if largest_change <= 1e-12 * limit_nm:
+                break
+        return friction, inverse_inertia @ friction
+
+    def _measure(self, elapsed_ns: int) -> tuple[FloatArray, FloatArray]:
+        resolution = self._settings.encoder_resolution_rad
+        if resolution > 0.0:
+            position = np.round(self._q / resolution) * resolution
+            if self._encoder_rad is not None and elapsed_ns > 0:
+                elapsed_s = elapsed_ns / 1e9
+                difference = (position - self._encoder_rad) / elapsed_s
+                weight = elapsed_s / (elapsed_s + self._settings.velocity_filter_s)
+                self._filtered_rad_s += weight * (difference - self._filtered_rad_s)
+            self._encoder_rad = position
+            position, velocity = position.copy(), self._filtered_rad_s.copy()
+        else:
+            position, velocity = self._q.copy(), self._q_dot.copy()
+        noise = self._settings.velocity_noise_rad_s
+        if noise > 0.0:
+            velocity += noise * self._random.standard_normal(self.joints)
+        return position, velocity
+
+
+def _create(settings: SimulatedSettings, context: DeviceContext) -> SimulatedDevice:
+    return SimulatedDevice(
+        context.model,
+        settings,
+        context.contact,
+        context.now_ns,
+        context.session_start_ns,
+        context.seed,
+    )
+
+
+DRIVER = DriverEntry(settings=SimulatedSettings, create=_create)
