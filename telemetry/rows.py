@@ -16,7 +16,7 @@ NO_PEER_STATE: Final = 255
 """The `peer_state` of a site that has never heard its peer."""
 
 MAX_JOINTS: Final = 16
-MAX_DIMENSION: Final = 3
+DIMENSIONS: Final = (2, 3)
 
 
 class TelemetryError(Exception):
@@ -84,13 +84,13 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
 def row_dtype(joints: int, dimension: int) -> np.dtype[np.void]:
     """Dtype of one row of a site with this many joints and task dimensions.
 
-    Packed and little-endian, in the order of `COLUMNS`. TelemetryError outside 1..16 joints or
-    1..3 dimensions.
+    Packed and little-endian, in the order of `COLUMNS`. TelemetryError outside 1 to 16 joints
+    or 2 or 3 dimensions.
     """
     if not 1 <= joints <= MAX_JOINTS:
         raise TelemetryError(f"{joints} joints; rows hold 1 to {MAX_JOINTS}")
-    if not 1 <= dimension <= MAX_DIMENSION:
-        raise TelemetryError(f"{dimension} task dimensions; rows hold 1 to {MAX_DIMENSION}")
+    if dimension not in DIMENSIONS:
+        raise TelemetryError(f"{dimension} task dimensions; rows hold 2 or 3")
     length = {"joint": (joints,), "task": (dimension,)}
     fields: list[Any] = [
         (name, column.format, length.get(column.axis, ())) for name, column in COLUMNS.items()
