@@ -1,1 +1,1 @@
-"""The hardware-abstraction layer: device interface, robot model, simulated backend, driver registry."""
+"""The hardware-abstraction layer: device interface, robot model, simulated arm, registry."""

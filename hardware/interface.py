@@ -4,7 +4,7 @@ Errors::
 
     HardwareError
     ├── DeviceError                 at run time: stop, and look at the machine
-    └── DeviceConfigurationError    before anything moves: the session file or the installation is wrong
+    └── DeviceConfigurationError    before anything moves: session file or installation is wrong
 """
 
 import difflib
@@ -86,7 +86,7 @@ class Device(Protocol):
         ...
 
     def stop(self) -> None:
-        """Zero the torque and switch the outputs off; never raises, idempotent, valid at any time."""
+        """Zero the torque, outputs off; never raises, idempotent, valid at any time."""
         ...
 
     def close(self) -> None:

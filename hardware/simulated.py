@@ -130,9 +130,8 @@ class SimulatedDevice:
         """Simulate up to now and return the measured state."""
         self._require_open()
         now_ns = self._now_ns()
-        elapsed_ns = now_ns - self._last_ns
         self._advance(now_ns)
-        position, velocity = self._measure(elapsed_ns)
+        position, velocity = self._measure(now_ns)
         wrench = np.zeros(6)
         if self._contact is not None:
             X, X_dot, _ = self._model.end_effector(self._q, self._q_dot)
@@ -169,7 +168,9 @@ class SimulatedDevice:
         self._q = np.array(self._settings.initial_position_rad)
         self._q_dot = np.zeros(self.joints)
         self._torque = np.zeros(self.joints)
+        self._friction = np.zeros(self.joints)
         self._encoder_rad: FloatArray | None = None
+        self._measured_ns = 0
         self._filtered_rad_s = np.zeros(self.joints)
         self._random = np.random.default_rng(self._seed)
 
@@ -192,13 +193,15 @@ class SimulatedDevice:
         step_s = elapsed_ns / (steps * 1e9)
         start_s = self._session_s(now_ns - elapsed_ns)
         for step in range(steps):
-            self._step(start_s + step * step_s, step_s)
+            q, q_dot = self._step(start_s + step * step_s, step_s)
             # Written so that a NaN too counts as diverged.
-            if not np.abs(self._q_dot).max() < DIVERGED_RAD_S:
+            if not np.abs(q_dot).max() < DIVERGED_RAD_S:
                 raise DeviceError(
-                    f"the simulation diverged at {start_s:.3f} s: joint velocity {self._q_dot} "
-                    f"rad/s; lower the gains or step_s (now {self._settings.step_s} s)"
+                    f"the simulation diverged at {start_s:.3f} s: joint velocity {q_dot} rad/s is "
+                    f"beyond {DIVERGED_RAD_S:g}; lower the gains or step_s "
+                    f"(now {self._settings.step_s} s)"
                 )
+            self._q, self._q_dot = q, q_dot
 
     def _acceleration(
         self, time_s: float, q: FloatArray, q_dot: FloatArray, torque: FloatArray
@@ -209,14 +212,14 @@ class SimulatedDevice:
             torque += J.T @ self._contact.force_n(time_s, X, X_dot)
         return self._model.forward_dynamics(q, q_dot, torque)
 
-    def _step_semi_implicit(self, time_s: float, step_s: float) -> None:
+    def _step_semi_implicit(self, time_s: float, step_s: float) -> tuple[FloatArray, FloatArray]:
         acceleration = self._acceleration(time_s, self._q, self._q_dot, self._torque)
         if self._settings.coulomb_friction_nm > 0.0:
             acceleration += self._coulomb_friction(acceleration, step_s)[1]
-        self._q_dot = self._q_dot + step_s * acceleration
-        self._q = self._q + step_s * self._q_dot
+        q_dot = self._q_dot + step_s * acceleration
+        return self._q + step_s * q_dot, q_dot
 
-    def _step_rk4(self, time_s: float, step_s: float) -> None:
+    def _step_rk4(self, time_s: float, step_s: float) -> tuple[FloatArray, FloatArray]:
         q, v, torque = self._q, self._q_dot, self._torque
         a1 = self._acceleration(time_s, q, v, torque)
         if self._settings.coulomb_friction_nm > 0.0:
@@ -230,8 +233,10 @@ class SimulatedDevice:
         a3 = self._acceleration(time_s + half_s, q + half_s * v2, v3, torque)
         v4 = v + step_s * a3
         a4 = self._acceleration(time_s + step_s, q + step_s * v3, v4, torque)
-        self._q = q + step_s / 6.0 * (v + 2.0 * (v2 + v3) + v4)
-        self._q_dot = v + step_s / 6.0 * (a1 + 2.0 * (a2 + a3) + a4)
+        return (
+            q + step_s / 6.0 * (v + 2.0 * (v2 + v3) + v4),
+            v + step_s / 6.0 * (a1 + 2.0 * (a2 + a3) + a4),
+        )
 
     def _coulomb_friction(
         self, acceleration: FloatArray, step_s: float
@@ -239,36 +244,45 @@ class SimulatedDevice:
         """Return the friction torque of one step and the acceleration it adds.
 
         The torque within ±limit that leaves the least kinetic energy ½vᵀMv after the step, found
-        joint by joint (projected Gauss–Seidel from zero). Every sweep lowers that energy, so
-        friction can hold a joint still but neither chatter nor drive it.
+        joint by joint (projected Gauss–Seidel). Every sweep lowers that energy, so friction can
+        hold a joint still but neither chatter nor drive it.
         """
         limit_nm = self._settings.coulomb_friction_nm
         inverse_inertia = self._model.inverse_inertia(self._q)
         free_velocity = self._q_dot + step_s * acceleration
-        friction = np.zeros(self.joints)
+        # The last step's friction is the best start, unless it would feed energy in now.
+        start = self._friction
+        if start @ (free_velocity + 0.5 * step_s * (inverse_inertia @ start)) > 0.0:
+            start = np.zeros(self.joints)
+        # Lists: for a handful of joints, scalar by scalar, they are faster than arrays.
+        velocity = (free_velocity + step_s * (inverse_inertia @ start)).tolist()
+        friction = start.tolist()
+        columns = (step_s * inverse_inertia).tolist()
         for _ in range(FRICTION_SWEEPS):
             largest_change = 0.0
-            for joint in range(self.joints):
-                row = inverse_inertia[joint]
-                velocity = free_velocity[joint] + step_s * (row @ friction)
-                previous = friction[joint]
-                stopping = previous - velocity / (step_s * row[joint])
-                friction[joint] = min(max(stopping, -limit_nm), limit_nm)
-                largest_change = max(largest_change, abs(friction[joint] - previous))
+            for joint, column in enumerate(columns):
+                stopping = friction[joint] - velocity[joint] / column[joint]
+                change = min(max(stopping, -limit_nm), limit_nm) - friction[joint]
+                friction[joint] += change
+                velocity = [v + change * c for v, c in zip(velocity, column, strict=True)]
+                largest_change = max(largest_change, abs(change))
             if largest_change <= 1e-12 * limit_nm:
                 break
-        return friction, inverse_inertia @ friction
+        self._friction = np.array(friction)
+        return self._friction, inverse_inertia @ self._friction
 
-    def _measure(self, elapsed_ns: int) -> tuple[FloatArray, FloatArray]:
+    def _measure(self, now_ns: int) -> tuple[FloatArray, FloatArray]:
         resolution = self._settings.encoder_resolution_rad
         if resolution > 0.0:
             position = np.round(self._q / resolution) * resolution
-            if self._encoder_rad is not None and elapsed_ns > 0:
-                elapsed_s = elapsed_ns / 1e9
+            if self._encoder_rad is None:
+                self._encoder_rad, self._measured_ns = position, now_ns
+            elif now_ns > self._measured_ns:
+                elapsed_s = (now_ns - self._measured_ns) / 1e9
                 difference = (position - self._encoder_rad) / elapsed_s
                 weight = elapsed_s / (elapsed_s + self._settings.velocity_filter_s)
                 self._filtered_rad_s += weight * (difference - self._filtered_rad_s)
-            self._encoder_rad = position
+                self._encoder_rad, self._measured_ns = position, now_ns
             position, velocity = position.copy(), self._filtered_rad_s.copy()
         else:
             position, velocity = self._q.copy(), self._q_dot.copy()
