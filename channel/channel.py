@@ -1,0 +1,308 @@
+"""One site's end of the channel: what it knows of its peer, and what it tells it."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from channel.clock_offset import ClockOffset, OffsetEstimate
+from channel.delay import Direction
+from channel.injection import DelayMode, Injection
+from channel.link import Link
+from channel.packet import NO_EPOCH, NO_STAMP, Packet, PacketError, Reject, decode, encode
+
+FloatArray = npt.NDArray[np.float64]
+
+_MISMATCH_SHOWN_NS = 1_000_000_000  # for people: long enough to be read, short enough to clear
+
+
+@dataclass(frozen=True, slots=True)
+class PeerSample:
+    """The peer's sample in use at a tick; vectors (z,) in base axes, read-only.
+
+    `stamp_ns` is on the peer's clock. `age_ns` is how old the sample is, by the clock offset
+    estimate. `round_trip_ns` is the age of the whole loop on my clock alone: now minus my own stamp
+    that the peer was using when it sent this; injected delay, network, packet spacing and hold are
+    all in it. It is None while the peer was using no sample of mine.
+    """
+
+    stamp_ns: int
+    sequence: int
+    position_m: FloatArray
+    velocity_m_s: FloatArray
+    force_n: FloatArray
+    state: int
+    round_trip_ns: int | None
+    age_ns: int
+
+
+@dataclass(slots=True)
+class Counters:
+    """What passed and what did not, since the start."""
+
+    sent: int = 0
+    send_dropped: int = 0
+    received: int = 0
+    """Valid packets, in order."""
+    lost: int = 0
+    """Sequence numbers skipped: lost on the way, by injection, or overtaken (then rejected too)."""
+    lost_injected: int = 0
+    late: int = 0
+    """Packets that arrived after their exact injected delay had passed."""
+    overtaken: int = 0
+    """Packets that injection released after a newer one."""
+    peer_restarts: int = 0
+    rejected: Counter[Reject] = field(default_factory=Counter)
+
+
+class Channel:
+    """Validate, delay, choose; stamp, echo, send. One thread, one call of each a tick."""
+
+    def __init__(
+        self,
+        link: Link,
+        *,
+        site: int,
+        session_digest: int,
+        epoch: int,
+        dimension: int,
+        send_period_ns: int,
+        silence_ns: int,
+        session_start_ns: int,
+        direction: Direction | None = None,
+        mode: DelayMode = "off",
+        seed: int = 0,
+        shared_clock: bool = False,
+    ) -> None:
+        """Join `link`. `site` is mine, 0 or 1; `direction` and `mode` delay what comes to me.
+
+        `epoch` names this run of the process and must differ from every earlier one. A silence of
+        `silence_ns` is what it takes to accept a restarted peer. Session time, which the delay
+        models run on, is zero at `session_start_ns` (my clock, may lie ahead). `shared_clock` says
+        that both sites stamp on one clock: the offset is then zero, not estimated.
+        """
+        _require_range("site", site, 0, 1)
+        _require_range("session_digest", session_digest, 0, 2**64 - 1)
+        _require_range("epoch", epoch, NO_EPOCH + 1, 2**64 - 1)
+        _require_range("dimension", dimension, 2, 3)
+        _require_range("send_period_ns", send_period_ns, 0, 2**63 - 1)
+        _require_range("silence_ns", silence_ns, 1, 2**63 - 1)
+        self._link = link
+        self._site = site
+        self._session = session_digest
+        self._epoch = epoch
+        self._dimension = dimension
+        self._send_period_ns = send_period_ns
+        self._silence_ns = silence_ns
+        self._clock_offset = ClockOffset()
+        self._shared_clock = shared_clock
+        # the receiving site names the direction: each has its own draws from the one seed
+        self._injection = Injection(
+            direction, mode, session_start_ns=session_start_ns, seed=(seed, site)
+        )
+        self.counters = Counters()
+        self._now_ns: int | None = None
+        self._newest: Packet | None = None
+        self._heard_ns = 0
+        self._mismatch_ns: int | None = None
+        self._used_stamp_ns = NO_STAMP
+        self._sequence = 0
+        self._due_ns: int | None = None
+        self._asked_ns = 0
+        self._vectors: FloatArray = np.zeros((3, dimension))
+
+    def latest(self, now_ns: int) -> PeerSample | None:
+        """Take in all that arrived and return the sample to use at `now_ns` [my clock].
+
+        None until a sample is due, and until the peer has answered a packet of mine (the clock
+        offset comes from that). While the peer is silent the last sample stays, and ages. Real-time
+        safe, never raises.
+        """
+        self._now_ns = now_ns
+        for data in self._link.receive():
+            self._arrive(data, now_ns)
+        offset_ns = 0 if self._shared_clock else self._clock_offset.offset_ns
+        if offset_ns is None:
+            return None
+        packet = self._injection.choose(now_ns, offset_ns)
+        self.counters.late = self._injection.late
+        self.counters.overtaken = self._injection.overtaken
+        if packet is None:
+            self._used_stamp_ns = NO_STAMP
+            return None
+        self._used_stamp_ns = packet.stamp_ns
+        answered = packet.echo_epoch == self._epoch and packet.used_stamp_ns != NO_STAMP
+        return PeerSample(
+            packet.stamp_ns,
+            packet.sequence,
+            packet.position_m,
+            packet.velocity_m_s,
+            packet.force_n,
+            packet.state,
+            now_ns - packet.used_stamp_ns if answered else None,
+            now_ns - packet.stamp_ns - offset_ns,
+        )
+
+    def send(
+        self,
+        now_ns: int,
+        state: int,
+        position_m: FloatArray,
+        velocity_m_s: FloatArray,
+        force_n: FloatArray,
+    ) -> bool:
+        """Send my sample, vectors (z,), if one is due; return whether a packet left.
+
+        Call it every tick: it sends at the tick nearest to each multiple of the send period. Real-
+        time safe; ValueError if a vector is not (z,).
+        """
+        if not self._due(now_ns):
+            return False
+        vectors = self._vectors
+        vectors[0] = position_m
+        vectors[1] = velocity_m_s
+        vectors[2] = force_n
+        newest = self._newest
+        self._sequence += 1
+        data = encode(
+            site=self._site,
+            state=state,
+            session=self._session,
+            epoch=self._epoch,
+            sequence=self._sequence,
+            stamp_ns=now_ns,
+            echo_epoch=newest.epoch if newest is not None else NO_EPOCH,
+            echo_stamp_ns=newest.stamp_ns if newest is not None else NO_STAMP,
+            echo_arrival_ns=self._heard_ns,
+            used_stamp_ns=self._used_stamp_ns,
+            vectors=vectors,
+        )
+        if not self._link.send(data):
+            self.counters.send_dropped += 1
+            return False
+        self.counters.sent += 1
+        return True
+
+    @property
+    def heard_ns(self) -> int | None:
+        """When the newest valid packet arrived [my clock]; None before the first."""
+        return self._heard_ns if self._newest is not None else None
+
+    @property
+    def heard_state(self) -> int | None:
+        """The peer's state in the newest valid packet, not delayed; None before the first."""
+        return self._newest.state if self._newest is not None else None
+
+    @property
+    def peer_confirmed(self) -> bool:
+        """Whether the newest valid packet answers this very run of mine: no recording can."""
+        return self._newest is not None and self._newest.echo_epoch == self._epoch
+
+    @property
+    def session_mismatch(self) -> bool:
+        """Whether a peer with another session file was heard within the last second."""
+        if self._mismatch_ns is None or self._now_ns is None:
+            return False
+        return self._now_ns - self._mismatch_ns < _MISMATCH_SHOWN_NS
+
+    @property
+    def offset(self) -> OffsetEstimate | None:
+        """The clock offset, from the peer's to mine; None before the first exchange."""
+        if self._shared_clock:
+            return OffsetEstimate(0, 0)
+        return None if self._now_ns is None else self._clock_offset.estimate(self._now_ns)
+
+    @property
+    def one_way_ns(self) -> int | None:
+        """Network time of the newest valid packet to me [ns], ± the offset's uncertainty."""
+        offset_ns = 0 if self._shared_clock else self._clock_offset.offset_ns
+        if self._newest is None or offset_ns is None:
+            return None
+        return self._heard_ns - self._newest.stamp_ns - offset_ns
+
+    def _arrive(self, data: bytes, now_ns: int) -> None:
+        try:
+            packet = decode(data)
+        except PacketError as error:
+            self.counters.rejected[error.reason] += 1
+            return
+        reason = self._foreign(packet, now_ns)
+        if reason is not None:
+            self.counters.rejected[reason] += 1
+            return
+        copies = self._injection.copies()
+        if copies == 0:
+            self.counters.lost_injected += 1
+            return
+        for _ in range(copies):
+            self._accept(packet, now_ns)
+
+    def _foreign(self, packet: Packet, now_ns: int) -> Reject | None:
+        """Return why this is not from my peer in its present run; None if it is."""
+        if packet.site != 1 - self._site:
+            return Reject.SITE
+        if packet.session != self._session:
+            self._mismatch_ns = now_ns
+            return Reject.SESSION
+        if packet.position_m.size != self._dimension:
+            return Reject.DIMENSION
+        newest = self._newest
+        if newest is not None and packet.epoch != newest.epoch:
+            silent = now_ns - self._heard_ns >= self._silence_ns
+            # a recording may have been heard first: it gives way to a peer that answers me
+            answers = packet.echo_epoch == self._epoch and newest.echo_epoch != self._epoch
+            if not silent and not answers:
+                return Reject.EPOCH
+        return None
+
+    def _accept(self, packet: Packet, now_ns: int) -> None:
+        newest = self._newest
+        if newest is not None and packet.epoch != newest.epoch:
+            self._forget_peer()
+            newest = None
+        if newest is not None:
+            gap = packet.sequence - newest.sequence
+            reason = None
+            if gap == 0:
+                reason = Reject.DUPLICATE
+            elif gap < 0:
+                reason = Reject.OUT_OF_ORDER
+            elif packet.stamp_ns <= newest.stamp_ns:
+                reason = Reject.STAMP
+            if reason is not None:
+                self.counters.rejected[reason] += 1
+                return
+            self.counters.lost += gap - 1
+        self.counters.received += 1
+        self._newest = packet
+        self._heard_ns = now_ns
+        if packet.echo_epoch == self._epoch and not self._shared_clock:
+            self._clock_offset.update(
+                packet.echo_stamp_ns, packet.echo_arrival_ns, packet.stamp_ns, now_ns
+            )
+        self._injection.put(packet, now_ns)
+
+    def _forget_peer(self) -> None:
+        self.counters.peer_restarts += 1
+        self._injection.clear()
+        self._clock_offset.reset()
+        self._used_stamp_ns = NO_STAMP
+
+    def _due(self, now_ns: int) -> bool:
+        if self._due_ns is None:
+            self._due_ns = now_ns
+            self._asked_ns = now_ns
+        half_tick_ns = (now_ns - self._asked_ns) // 2
+        self._asked_ns = now_ns
+        if now_ns + half_tick_ns < self._due_ns:
+            return False
+        self._due_ns += self._send_period_ns
+        if self._due_ns <= now_ns:  # after a stall: no burst to catch up
+            self._due_ns = now_ns + self._send_period_ns
+        return True
+
+
+def _require_range(key: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{key} = {value} is not allowed: it must be between {low} and {high}")
