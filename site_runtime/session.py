@@ -1,0 +1,116 @@
+"""The session file: TOML that both sites read, as typed, frozen, validated values.
+
+Both sites must hold the same session. `Session.digest` says so: neither comments nor addresses
+nor a machine's real-time settings change it, every other key does.
+"""
+
+import hashlib
+import json
+import tomllib
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from channel.delay import TraceDelay
+from hardware.interface import HardwareError
+from hardware.robot_model import UrdfArm
+from site_runtime.session_checks import DIRECTIONS, contradictions
+from site_runtime.session_problems import (
+    ABSENT,
+    Lines,
+    Problem,
+    SessionError,
+    SessionFileError,
+    explain,
+)
+from site_runtime.session_settings import SessionFile
+
+__all__ = ["Session", "SessionError", "SessionFileError", "load_session", "parse_session"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Session(SessionFile):
+    """A validated session: the file's keys, its text, and the digest that both sites compare."""
+
+    path: Path
+    text: str
+    digest: int
+
+
+_ADAPTER = TypeAdapter(SessionFile)
+_SITES = ("local", "remote")
+
+
+def load_session(path: Path | str) -> Session:
+    """Read and validate a session file; raises SessionFileError with every problem found."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SessionFileError(path, [Problem("the file", ABSENT, str(error))]) from error
+    return parse_session(text, path)
+
+
+def parse_session(text: str, path: Path) -> Session:
+    """Validate a session file's text; paths in it are relative to the folder of `path`."""
+    try:
+        document = tomllib.loads(text)
+        _resolve_paths(document, path.resolve().parent)
+        # As JSON, strict mode takes a list for a tuple and still refuses "1" for a number.
+        as_json = json.dumps(document, default=str)
+    except (ValueError, RecursionError) as error:
+        raise SessionFileError(path, [Problem("the file", ABSENT, f"not TOML: {error}")]) from None
+    lines = Lines(text)
+    try:
+        file = _ADAPTER.validate_json(as_json)
+        problems = list(contradictions(file))
+        digest = _digest(file) if not problems else 0
+    except ValidationError as error:
+        problems = list(explain(error, SessionFile, document))
+    except (HardwareError, OSError) as error:
+        problems = [Problem("the file", ABSENT, str(error))]
+    if problems:
+        numbered = [replace(problem, line=lines.of(problem.key)) for problem in problems]
+        raise SessionFileError(path, numbered)
+    keys = {item.name: getattr(file, item.name) for item in fields(file)}
+    return Session(**keys, path=path, text=text, digest=digest)
+
+
+def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
+    """Make the paths absolute, so that nothing depends on where a daemon is started."""
+
+    def table(*keys: str) -> dict[str, Any]:
+        found: Any = document
+        for key in keys:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found if isinstance(found, dict) else {}
+
+    places = [(table(site, "robot"), "path") for site in _SITES]
+    places += [(table("channel", direction, "delay"), "path") for direction in DIRECTIONS]
+    places += [(table("network"), "zenoh_config")]
+    for holder, key in places:
+        if isinstance(holder.get(key), str):
+            holder[key] = str(folder / holder[key])
+
+
+def _digest(file: SessionFile) -> int:
+    """64 bits over everything that both sites must agree on."""
+    agreed = _plain(file)
+    for own in ("network", "real_time"):
+        del agreed[own]
+    canonical = json.dumps(agreed, sort_keys=True, separators=(",", ":"))
+    return int.from_bytes(hashlib.blake2b(canonical.encode(), digest_size=8).digest(), "little")
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401  JSON in the making
+    if is_dataclass(value):
+        table = {item.name: _plain(getattr(value, item.name)) for item in fields(value)}
+        if isinstance(value, UrdfArm | TraceDelay):
+            # Two machines keep the same file in different places.
+            table["path"] = hashlib.blake2b(Path(value.path).read_bytes()).hexdigest()
+        return table
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value
