@@ -1,1 +1,1 @@
-"""The paper: arrays in, arrays out. No clock, no I/O, no device; one block a file, equations cited."""
+"""The paper: arrays in, arrays out, no clock, no I/O, no device. One block a file, cited."""
