@@ -16,6 +16,8 @@ from pydantic import TypeAdapter, ValidationError
 from channel.delay import TraceDelay
 from hardware.interface import HardwareError
 from hardware.robot_model import UrdfArm
+from site_runtime.keys import SiteId
+from site_runtime.real_time import RealTimeSettings
 from site_runtime.session_checks import DIRECTIONS, contradictions
 from site_runtime.session_problems import (
     ABSENT,
@@ -25,9 +27,76 @@ from site_runtime.session_problems import (
     SessionFileError,
     explain,
 )
-from site_runtime.session_settings import SessionFile
+from site_runtime.session_settings import (
+    ChannelSettings,
+    ConstantOperator,
+    CouplingSettings,
+    DampingSettings,
+    DeviceSettings,
+    EngagementSettings,
+    EnvironmentSettings,
+    HumanArmOperator,
+    JointLimitsTask,
+    LimitSettings,
+    LinearSingularityTask,
+    LocalSettings,
+    LoopSettings,
+    ManipulabilityTask,
+    NetworkSettings,
+    NoOperator,
+    NullSpaceSettings,
+    ObstacleSettings,
+    ObstacleTask,
+    OperatorSettings,
+    PaperCoupling,
+    PaperObstacleTask,
+    Pulse,
+    PulsesOperator,
+    RemoteSettings,
+    SessionFile,
+    StiffnessCoupling,
+    SubTaskSettings,
+    TaskSettings,
+    WallSettings,
+)
 
-__all__ = ["Session", "SessionError", "SessionFileError", "load_session", "parse_session"]
+__all__ = [
+    "ChannelSettings",
+    "ConstantOperator",
+    "CouplingSettings",
+    "DampingSettings",
+    "DeviceSettings",
+    "EngagementSettings",
+    "EnvironmentSettings",
+    "HumanArmOperator",
+    "JointLimitsTask",
+    "LimitSettings",
+    "LinearSingularityTask",
+    "LocalSettings",
+    "LoopSettings",
+    "ManipulabilityTask",
+    "NetworkSettings",
+    "NoOperator",
+    "NullSpaceSettings",
+    "ObstacleSettings",
+    "ObstacleTask",
+    "OperatorSettings",
+    "PaperCoupling",
+    "PaperObstacleTask",
+    "Pulse",
+    "PulsesOperator",
+    "RealTimeSettings",
+    "RemoteSettings",
+    "Session",
+    "SessionError",
+    "SessionFileError",
+    "StiffnessCoupling",
+    "SubTaskSettings",
+    "TaskSettings",
+    "WallSettings",
+    "load_session",
+    "parse_session",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +106,10 @@ class Session(SessionFile):
     path: Path
     text: str
     digest: int
+
+    def site(self, identity: SiteId) -> LocalSettings | RemoteSettings:
+        """Return the settings of one site."""
+        return self.local if identity is SiteId.LOCAL else self.remote
 
 
 _ADAPTER = TypeAdapter(SessionFile)

@@ -171,14 +171,12 @@ def _joint_limits(key: str, task: JointLimitsTask, robot: RobotDescription) -> I
     lower, upper = task.lower_rad, task.upper_rad
     yield from _ordered(key, task, "lower_rad", "upper_rad")
     if lower is None and upper is None:
-        known = isinstance(robot, UrdfArm) and all(
-            math.isfinite(limit)
-            for side in build_robot(robot, None).position_limits_rad
-            for limit in side
+        low, high = (
+            build_robot(robot, None).position_limits_rad if isinstance(robot, UrdfArm) else ((), ())
         )
-        if not known:
+        if not any(map(math.isfinite, [*low, *high])):
             yield Problem(
-                f"{key}.lower_rad", ABSENT, "is missing, and the robot has joints without limits"
+                f"{key}.lower_rad", ABSENT, "is missing, and the robot's joints have no limits"
             )
 
 
