@@ -1,0 +1,289 @@
+"""Zenoh: the link between the sites, and the way telemetry leaves. The only file that imports it.
+
+No Python callback anywhere: everything arrives in rings that the reader drains, so that no thread
+of ours ever competes with the control loop for the interpreter.
+"""
+
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
+
+import zenoh
+
+from channel.link import LinkError
+
+_T = TypeVar("_T")
+_CLOSE_S = 2.0  # closing over a network that swallows everything takes Zenoh 10 s
+_PRESENCE = "present"
+
+_RingSubscriber: TypeAlias = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohSettings:
+    """Where to meet. Peers do not forward for each other: to hear both sites, connect to both.
+
+    Endpoints are Zenoh's, such as "tcp/192.168.1.2:7447". `lease_ms` is how long the other side
+    waits in silence before it takes this one for gone. `config_file` is a Zenoh configuration of
+    the user's own (routers, TLS, access control), taken as it is; only endpoints given here
+    override it.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    lease_ms: int = 500
+    config_file: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.lease_ms < 1:
+            raise ValueError(f"lease_ms = {self.lease_ms} is not allowed: it must be at least 1 ms")
+
+
+class ZenohLink:
+    """One site's end of the link; made by `ZenohNode.link`."""
+
+    def __init__(self, session: zenoh.Session, own_key: str, peer_key: str, capacity: int) -> None:
+        ring = zenoh.handlers.RingChannel
+        self._closed = False
+        self._present: set[str] = set()
+        self._subscriber = session.declare_subscriber(peer_key, ring(capacity))
+        self._publisher = session.declare_publisher(
+            own_key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+            reliability=zenoh.Reliability.BEST_EFFORT,
+        )
+        liveliness = session.liveliness()
+        # one token a run: the end of a killed one, noticed late, must not hide its successor
+        self._presence = liveliness.declare_subscriber(
+            f"{peer_key}/{_PRESENCE}/*", ring(64), history=True
+        )
+        self._token = liveliness.declare_token(f"{own_key}/{_PRESENCE}/{session.zid()}")
+
+    def send(self, data: bytes) -> bool:
+        """Publish `data`, dropping it rather than waiting; False once closed.
+
+        True means handed over: Zenoh does not tell whether anyone listens, or what it drops.
+        """
+        if self._closed:
+            return False
+        try:
+            self._publisher.put(data)
+        except zenoh.ZError:
+            return False
+        return True
+
+    def receive(self) -> list[bytes]:
+        """Return what the ring holds, oldest first, and empty it."""
+        return [] if self._closed else [s.payload.to_bytes() for s in _drain(self._subscriber)]
+
+    def peer_present(self) -> bool:
+        """Whether a peer has announced itself and not gone; a cut shows after its lease."""
+        if self._closed:
+            return False
+        for sample in _drain(self._presence):
+            run = str(sample.key_expr)
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._present.add(run)
+            else:
+                self._present.discard(run)
+        return bool(self._present)
+
+    def close(self) -> None:
+        """Leave the link; the node stays open."""
+        if self._closed:
+            return
+        self._closed = True
+        _bounded(
+            self._token.undeclare,
+            self._presence.undeclare,
+            self._publisher.undeclare,
+            self._subscriber.undeclare,
+        )
+
+
+class Subscription:
+    """A ring of what others publish; made by `ZenohNode.subscriber`."""
+
+    def __init__(self, session: zenoh.Session, key_expression: str, capacity: int) -> None:
+        self._closed = False
+        self._subscriber = session.declare_subscriber(
+            key_expression, zenoh.handlers.RingChannel(capacity)
+        )
+
+    def receive(self) -> list[tuple[str, bytes]]:
+        """Return (key, payload) of what arrived since the last call, oldest first. Never blocks."""
+        if self._closed:
+            return []
+        return [(str(s.key_expr), s.payload.to_bytes()) for s in _drain(self._subscriber)]
+
+    def close(self) -> None:
+        """Stop listening. Idempotent, never raises."""
+        if not self._closed:
+            self._closed = True
+            _bounded(self._subscriber.undeclare)
+
+
+class ZenohNode:
+    """One process's place in the Zenoh network: one session, and what is declared on it."""
+
+    def __init__(self, settings: ZenohSettings) -> None:
+        """Open the session; LinkError if an endpoint is malformed, unknown or taken.
+
+        A peer that is not there yet is no error: Zenoh keeps trying to connect.
+        """
+        if not (settings.listen or settings.connect or settings.config_file):
+            raise LinkError(
+                "nowhere to meet: give an endpoint to listen on or to connect to, "
+                "such as tcp/192.168.1.2:7447, or a Zenoh configuration file"
+            )
+        self._closed = False
+        self._open: list[ZenohLink | Subscription] = []
+        try:
+            self._session = zenoh.open(_config(settings))
+        except zenoh.ZError as error:
+            raise LinkError(_advice(settings, error)) from error
+
+    def link(self, own_key: str, peer_key: str, capacity: int = 256) -> ZenohLink:
+        """Return a link that publishes on `own_key` and listens to `peer_key`.
+
+        Its ring keeps the newest `capacity` datagrams: the ticks a stall may cost.
+        """
+        link = self._declare(lambda: ZenohLink(self._session, own_key, peer_key, capacity))
+        self._open.append(link)
+        return link
+
+    def publisher(self, key: str) -> Callable[[bytes], None]:
+        """Return a function that publishes bytes on `key` for people: low priority, may drop.
+
+        It never blocks and never raises, after `close` too.
+        """
+        publisher = self._declare(
+            lambda: self._session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        )
+
+        def publish(data: bytes) -> None:
+            if self._closed:
+                return
+            try:
+                publisher.put(data)
+            except zenoh.ZError:
+                return  # closed between the two lines
+
+        return publish
+
+    def subscriber(self, key_expression: str, capacity: int) -> Subscription:
+        """Return a subscription to `key_expression` that keeps the newest `capacity` payloads."""
+        subscription = self._declare(lambda: Subscription(self._session, key_expression, capacity))
+        self._open.append(subscription)
+        return subscription
+
+    def close(self) -> None:
+        """Close the session and all that is on it, within seconds. Idempotent, never raises.
+
+        Call it last, with the device stopped: a dead network makes it wait.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        for declared in self._open:
+            declared._closed = True  # the session undeclares them all at once
+        _bounded(self._session.close)
+
+    def _declare(self, declare: Callable[[], _T]) -> _T:
+        try:
+            return declare()
+        except zenoh.ZError as error:
+            raise LinkError(f"Zenoh refuses to declare a key: {_brief(error)}") from error
+
+
+def _config(settings: ZenohSettings) -> zenoh.Config:
+    values: dict[str, Any] = {}
+    if settings.config_file is not None:
+        if not Path(settings.config_file).is_file():
+            raise LinkError(f"config_file = {settings.config_file!r} does not exist")
+        config = zenoh.Config.from_file(settings.config_file)
+        if settings.listen:
+            values["listen/endpoints"] = settings.listen
+        if settings.connect:
+            values["connect/endpoints"] = settings.connect
+    else:
+        config = zenoh.Config()
+        values = {
+            "mode": "peer",
+            # also when empty: Zenoh's default listens on every interface
+            "listen/endpoints": settings.listen,
+            "connect/endpoints": settings.connect,
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {
+                "period_init_ms": 100,
+                "period_max_ms": 1000,
+                "period_increase_factor": 1.5,
+            },
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            # do not hold up the start for peers that come later anyway
+            "open/return_conditions/connect_scouted": False,
+            "timestamping/enabled": False,
+            "transport/shared_memory/enabled": False,
+            "transport/unicast/open_timeout": 2000,
+            "transport/unicast/accept_timeout": 2000,
+            "transport/link/tx/lease": settings.lease_ms,
+            "transport/link/tx/keep_alive": 4,
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        }
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _drain(subscriber: "_RingSubscriber") -> list[zenoh.Sample]:
+    samples: list[zenoh.Sample] = []
+    try:
+        while (sample := subscriber.try_recv()) is not None:
+            samples.append(sample)
+    except zenoh.ZError:
+        pass  # closed meanwhile
+    return samples
+
+
+def _bounded(*actions: Callable[[], object]) -> None:
+    def run() -> None:
+        for action in actions:
+            try:
+                action()
+            except zenoh.ZError:
+                continue  # going away is all that was wanted
+
+    thread = threading.Thread(target=run, name="zenoh-close", daemon=True)
+    thread.start()
+    thread.join(_CLOSE_S)
+
+
+def _advice(settings: ZenohSettings, error: zenoh.ZError) -> str:
+    where = ", ".join(
+        f"{name} = {endpoints}"
+        for name, endpoints in (
+            ("listen", list(settings.listen)),
+            ("connect", list(settings.connect)),
+            ("config_file", settings.config_file),
+        )
+        if endpoints
+    )
+    return (
+        f"cannot open Zenoh with {where}: {_brief(error)}. An endpoint reads protocol/host:port; "
+        "one to listen on needs an address of this machine and a port no other program has"
+    )
+
+
+def _brief(error: zenoh.ZError) -> str:
+    return str(error).split(" at /")[0]  # without the source positions of Zenoh's build
