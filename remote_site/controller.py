@@ -10,6 +10,7 @@ from control_law.coupling import Coupling
 from control_law.damping import Damping
 from control_law.null_space import null_space_velocity, project
 from control_law.ramp import smooth_ramp
+from control_law.sub_tasks.composite import ramped
 from control_law.sub_tasks.sub_task import SubTask
 from hardware.robot_model import RobotTerms
 from site_runtime.controller import Command
@@ -44,8 +45,7 @@ class RemoteController:
         self, sub_task: SubTask, terms: RobotTerms, engaged_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """ζ and ζ̇ of (4), the sub-task's gradient ramped in."""
-        ramp, ramp_rate = smooth_ramp(engaged_s, self.sub_task_ramp_s)
-        g, g_dot = sub_task.evaluate(terms)
-        return null_space_velocity(
-            terms.J, terms.J_dot, ramp * g, ramp * g_dot + ramp_rate * g, self.regularisation
+        g, g_dot = ramped(
+            *sub_task.evaluate(terms), smooth_ramp(engaged_s, self.sub_task_ramp_s)
         )
+        return null_space_velocity(terms.J, terms.J_dot, g, g_dot, self.regularisation)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from channel.channel import Channel, PeerSample
 from control_law.null_space import manipulability
-from control_law.obstacle_distance import midpoint_distance, segment_distance
+from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
 from hardware.interface import Device, DeviceState
 from hardware.robot_model import RobotModel, RobotTerms
 from site_runtime.clock import Clock, LatenessHistogram, Pacer
@@ -36,7 +36,7 @@ class Site:
     """Device, channel, controller, supervisor and guard of one side of the teleoperation.
 
     The same object runs in a daemon on a steady clock and in simulation on a manual one.
-    `certified_round_trip_s` is what the gains are proven for, `obstacles_m` (k,3) are centres.
+    `certified_round_trip_s` is what the gains are proven for, `obstacles_m` are the centres, (z,) each.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Site:
         clock: Clock,
         times: SiteTimes,
         certified_round_trip_s: float,
-        obstacles_m: FloatArray,
+        obstacles_m: tuple[FloatArray, ...],
     ) -> None:
         self.identity = identity
         self.channel = channel
@@ -194,7 +194,7 @@ class Site:
             sub_task_error_rad_s=command.sub_task_error_rad_s,
             lost=counters.lost,
             late=counters.late,
-            rejected=counters.rejected_total,
+            rejected=counters.rejected.total(),
             missed=self.missed,
         )
 

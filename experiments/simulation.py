@@ -1,0 +1,109 @@
+"""Both sites' own code on one manual clock: a session simulated, bit for bit repeatable."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from channel.memory_link import memory_links
+from local_site.site import build_local_site
+from remote_site.site import build_remote_site
+from site_runtime.assembly import Surroundings
+from site_runtime.clock import ManualClock
+from site_runtime.session import Session
+from site_runtime.site import Site
+from telemetry.rows import RowArray
+from telemetry.stream import decode_batch
+
+_SETTLE_NS = 100_000_000
+_LOCAL_EPOCH, _REMOTE_EPOCH = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """The rows of both sites from session time zero on, and why a site failed, if one did."""
+
+    local: RowArray
+    remote: RowArray
+    failures: tuple[str, ...]
+
+
+class Simulation:
+    """Two sites, one clock, an in-memory link.
+
+    The channel fills before session time zero, robots standing still under their brakes: at zero
+    both sites engage at once, each knowing the other's past, as the paper's equations assume.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._period_ns = session.period_ns
+        self._start_ns = _warm_up_ns(session)
+        self.clock = ManualClock()
+        self._batches: tuple[list[bytes], list[bytes]] = ([], [])
+        local_link, remote_link = memory_links()
+        self.local = build_local_site(
+            session,
+            Surroundings(
+                local_link,
+                self.clock,
+                self._start_ns,
+                _LOCAL_EPOCH,
+                self._batches[0].append,
+                shared_clock=True,
+            ),
+        )
+        self.remote = build_remote_site(
+            session,
+            Surroundings(
+                remote_link,
+                self.clock,
+                self._start_ns,
+                _REMOTE_EPOCH,
+                self._batches[1].append,
+                shared_clock=True,
+            ),
+        )
+
+    def run(self, duration_s: float, progress: Callable[[float], None] | None = None) -> Run:
+        """Run to session time `duration_s`, or until a site fails; `progress` gets it [s]."""
+        sites = (self.local, self.remote)
+        for site in sites:
+            site.open()
+        ticks = round(self._start_ns / self._period_ns + duration_s * 1e9 / self._period_ns)
+        for tick in range(ticks + 1):
+            self.clock.sleep_until_ns(tick * self._period_ns)
+            for site in sites:
+                site.tick()
+                site.telemetry.flush()
+            if any(site.failure for site in sites):
+                break
+            if progress is not None and tick % 100 == 0:
+                progress(max(0.0, (self.clock.now_ns() - self._start_ns) * 1e-9))
+        for site in sites:
+            site.close()
+        local, remote = (_rows(batches) for batches in self._batches)
+        shared = min(len(local), len(remote))  # a site that fails writes no row of that tick
+        return Run(local[:shared], remote[:shared], tuple(map(_failure, filter(_failed, sites))))
+
+
+def _warm_up_ns(session: Session) -> int:
+    """Long enough for the channel to be full of samples, in whole ticks."""
+    settings = session.channel
+    fill_s = 0.0
+    if settings.injection != "off":
+        fill_s = settings.local_to_remote.bound_s + settings.remote_to_local.bound_s
+    warm_up_ns = round(fill_s * 1e9) + _SETTLE_NS + 10 * session.send_period_ns
+    return -(-warm_up_ns // session.period_ns) * session.period_ns
+
+
+def _rows(batches: list[bytes]) -> RowArray:
+    rows = np.concatenate([decode_batch(batch).rows for batch in batches])
+    return rows[rows["time_ns"] >= 0]
+
+
+def _failed(site: Site) -> bool:
+    return site.failure is not None
+
+
+def _failure(site: Site) -> str:
+    return f"{site.identity.label}: {type(site.failure).__name__}: {site.failure}"

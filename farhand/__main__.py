@@ -1,0 +1,29 @@
+"""The `farhand` command."""
+
+import typer
+
+from farhand.certify import certify
+from farhand.dashboard import dashboard
+from farhand.demo import demo
+from farhand.simulate import simulate
+from local_site.daemon import local
+from remote_site.daemon import remote
+
+app = typer.Typer(
+    name="farhand",
+    help="Move, and feel through, a robot at another site, over a network whose delay varies.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for command in (local, remote, dashboard, demo, simulate, certify):
+    app.command()(command)
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,27 @@
+"""How the commands speak to a person."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+
+from channel.link import LinkError
+from hardware.interface import HardwareError
+from site_runtime.session import SessionError
+from telemetry.rows import TelemetryError
+
+OUT = Console()
+ERR = Console(stderr=True)
+
+EXIT_USER_ERROR = 2
+
+
+@contextmanager
+def user_errors() -> Iterator[None]:
+    """Turn what a user can mend into a message and exit code 2; anything else stays a traceback."""
+    try:
+        yield
+    except (SessionError, HardwareError, LinkError, TelemetryError, OSError) as error:
+        ERR.print(str(error), style="red", highlight=False, markup=False)
+        raise typer.Exit(EXIT_USER_ERROR) from None

@@ -1,0 +1,163 @@
+"""One site as a process: session file in, Zenoh, real-time settings, the loop, a clean end."""
+
+import signal
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Annotated, TypeAlias
+
+import typer
+from rich.console import Console
+
+from channel.link import LinkError
+from channel.zenoh_link import ZenohNode, ZenohSettings
+from hardware.interface import HardwareError
+from site_runtime.assembly import Surroundings
+from site_runtime.clock import SteadyClock
+from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.real_time import RealTimeError, RealTimeReport, apply_real_time
+from site_runtime.session import Session, SessionError, load_session
+from site_runtime.site import Site
+from site_runtime.status import StatusLine, summary
+
+SessionPath: TypeAlias = Annotated[
+    Path, typer.Argument(metavar="SESSION.toml", help="The session file; the same at both sites.")
+]
+Connect: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--connect", help="Zenoh endpoint to reach, e.g. tcp/B.example:7447; repeatable."
+    ),
+]
+Listen: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--listen",
+        help="Zenoh endpoint to listen on; loopback unless given, e.g. tcp/0.0.0.0:7447.",
+    ),
+]
+Duration: TypeAlias = Annotated[
+    float | None, typer.Option("--duration", help="Stop after so many seconds.", min=0.001)
+]
+Quiet: TypeAlias = Annotated[
+    bool, typer.Option("--quiet", help="No live status line; the summary still comes.")
+]
+
+EXIT_FAULT = 1
+EXIT_NOT_STARTED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonOptions:
+    """What the command line may say over the session file; None leaves the file's word."""
+
+    connect: tuple[str, ...] | None
+    listen: tuple[str, ...] | None
+    duration_s: float | None
+    quiet: bool
+
+
+def run_daemon(
+    identity: SiteId,
+    build: Callable[[Session, Surroundings], Site],
+    session_path: Path,
+    options: DaemonOptions,
+) -> int:
+    """Run one site until Ctrl-C, SIGTERM or the duration's end; return the exit code.
+
+    0 after a clean end, 1 after a fault, 2 if it could not start.
+    """
+    console = Console(stderr=True)
+    try:
+        session = load_session(session_path)
+        clock = SteadyClock()
+        with closing(_node(session, identity, options)) as node:
+            surroundings = Surroundings(
+                link=node.link(
+                    state_key(session.name, identity), state_key(session.name, identity.peer)
+                ),
+                clock=clock,
+                session_start_ns=clock.now_ns(),
+                epoch=time.time_ns(),
+                publish=node.publisher(telemetry_key(session.name, identity)),
+            )
+            site = build(session, surroundings)
+            _greet(console, session, site)
+            cpus = session.real_time
+            cpu = cpus.local_cpu if identity is SiteId.LOCAL else cpus.remote_cpu
+            with (
+                _StopSignals(clock, options.duration_s) as signals,
+                StatusLine(site, quiet=options.quiet),
+                apply_real_time(session.real_time, cpu) as real_time,
+            ):
+                _report(console, real_time)
+                site.run(signals.asked_to_stop)
+            summary(site, Console())
+    except (SessionError, LinkError, HardwareError, RealTimeError) as error:
+        console.print(f"{identity.label} site: {error}", style="red", highlight=False, markup=False)
+        return EXIT_NOT_STARTED
+    return EXIT_FAULT if site.failure is not None else 0
+
+
+def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNode:
+    """Open the site's place in the network; the remote site listens, the local one connects too."""
+    network = session.network
+    local = identity is SiteId.LOCAL
+    listen = (network.local_listen if local else network.remote_listen,)
+    connect = (network.local_connect,) if local else ()
+    return ZenohNode(
+        ZenohSettings(
+            listen=listen if options.listen is None else options.listen,
+            connect=connect if options.connect is None else options.connect,
+            lease_ms=round(network.lease_s * 1e3),
+            config_file=network.zenoh_config,
+        )
+    )
+
+
+class _StopSignals:
+    """Ctrl-C, SIGTERM and the duration end the loop between two ticks, never inside one."""
+
+    def __init__(self, clock: SteadyClock, duration_s: float | None) -> None:
+        self._clock = clock
+        self._asked = False
+        self._end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * 1e9)
+        self._before: dict[int, object] = {}
+
+    def asked_to_stop(self) -> bool:
+        """Whether the loop should end."""
+        return self._asked or (self._end_ns is not None and self._clock.now_ns() >= self._end_ns)
+
+    def __enter__(self) -> "_StopSignals":
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._ask)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+
+
+def _greet(console: Console, session: Session, site: Site) -> None:
+    console.print(
+        f"[bold]farhand[/bold] {site.identity.label} site · session {session.name} "
+        f"({session.digest:016x}) · {session.loop.rate_hz} Hz · certified round trip "
+        f"{site.certified_round_trip_s * 1e3:.0f} ms",
+        highlight=False,
+    )
+
+
+def _report(console: Console, real_time: RealTimeReport) -> None:
+    for refusal in real_time.refused:
+        console.print(f"[yellow]real time:[/yellow] {refusal}", highlight=False)

@@ -1,0 +1,109 @@
+"""What a daemon prints: one live line while it runs, a summary when it ends."""
+
+import sys
+import threading
+from math import isnan
+from types import TracebackType
+
+from rich.console import Console
+from rich.table import Table
+
+from site_runtime.guard import Cut
+from site_runtime.site import Site
+from site_runtime.supervisor import State
+
+LIVE_INTERVAL_S = 0.5
+LOG_INTERVAL_S = 10.0
+
+
+class StatusLine:
+    """Prints one line about a site, from a thread of its own: a stopped terminal stalls only it.
+
+    Rewritten in place on a terminal twice a second; in a log, one line every ten seconds.
+    """
+
+    def __init__(self, site: Site, *, quiet: bool = False) -> None:
+        self._site = site
+        self._in_place = sys.stderr.isatty()
+        self._interval_s = LIVE_INTERVAL_S if self._in_place else LOG_INTERVAL_S
+        self._quiet = quiet
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._print_lines, name="status", daemon=True)
+
+    def __enter__(self) -> "StatusLine":
+        if not self._quiet:
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=1.0)
+            if self._in_place:
+                sys.stderr.write("\n")
+
+    def _print_lines(self) -> None:
+        before = self._site.ticks
+        while not self._ended.wait(self._interval_s):
+            ticks = self._site.ticks
+            line = describe(self._site, (ticks - before) / self._interval_s)
+            before = ticks
+            sys.stderr.write(f"\r\x1b[K{line}" if self._in_place else f"{line}\n")
+            sys.stderr.flush()
+
+
+def describe(site: Site, rate_hz: float) -> str:
+    """One line: state, rate, round trip, margin to the certified one, position error."""
+    round_trip_ms = site.round_trip_s * 1e3
+    margin_ms = (site.certified_round_trip_s - site.round_trip_s) * 1e3
+    parts = [f"{site.identity.label:6} {site.state.name:8} {rate_hz:6.0f} Hz"]
+    if isnan(round_trip_ms):
+        parts.append("no peer yet")
+    else:
+        parts.append(f"round trip {round_trip_ms:6.1f} ms")
+        parts.append(f"margin {margin_ms:6.1f} ms")
+    if not isnan(site.error_m):
+        parts.append(f"error {site.error_m * 1e3:6.1f} mm")
+    if site.channel.session_mismatch:
+        parts.append("the peer has ANOTHER session file")
+    if site.failure is not None:
+        parts.append(f"{type(site.failure).__name__}: {site.failure}")
+    return " · ".join(parts)
+
+
+def summary(site: Site, console: Console) -> None:
+    """Print what the run was: ticks, lateness, packets, cuts, the fault if there was one."""
+    p50, p99, p999, worst = site.lateness.percentiles_us(50, 99, 99.9, 100)
+    counters = site.channel.counters
+    table = Table(title=f"{site.identity.label} site", show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    table.add_row("ticks", f"{site.ticks} run, {site.missed} missed")
+    table.add_row(
+        "lateness", f"p50 {p50:.0f} · p99 {p99:.0f} · p99.9 {p999:.0f} · worst {worst:.0f} µs"
+    )
+    table.add_row(
+        "packets",
+        f"{counters.sent} sent, {counters.send_dropped} dropped here; "
+        f"{counters.received} received, {counters.lost} lost, {counters.late} late, "
+        f"{counters.rejected.total()} rejected",
+    )
+    if counters.rejected:
+        reasons = counters.rejected.most_common()
+        table.add_row("rejected", ", ".join(f"{count} {r.name.lower()}" for r, count in reasons))
+    cuts = {cut: count for cut, count in site.guard.counts.items() if count}
+    if cuts:
+        table.add_row(
+            "guard cut", ", ".join(f"{_CUT_NAMES[cut]} in {n} ticks" for cut, n in cuts.items())
+        )
+    if site.state is State.FAULT and site.failure is not None:
+        table.add_row("FAULT", f"[red]{type(site.failure).__name__}: {site.failure}")
+    console.print(table)
+
+
+_CUT_NAMES = {Cut.TORQUE: "torque", Cut.VELOCITY: "velocity", Cut.WORKSPACE: "workspace"}
