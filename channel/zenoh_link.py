@@ -17,6 +17,7 @@ from channel.link import LinkError
 
 _T = TypeVar("_T")
 _CLOSE_S = 2.0  # closing over a network that swallows everything takes Zenoh 10 s
+_QUEUE_BATCHES = 16  # of 64 KiB, the most Zenoh allows
 _PRESENCE = "present"
 
 _RingSubscriber: TypeAlias = zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]
@@ -160,7 +161,8 @@ class ZenohNode:
     def publisher(self, key: str) -> Callable[[bytes], None]:
         """Return a function that publishes bytes on `key` for people: low priority, may drop.
 
-        It never blocks and never raises, after `close` too.
+        It never blocks and never raises, after `close` too. Keep payloads below 256 KiB: of much
+        longer ones the queue cannot hold all fragments, and they never arrive.
         """
         publisher = self._declare(
             lambda: self._session.declare_publisher(
@@ -239,7 +241,11 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
             "transport/unicast/accept_timeout": 2000,
             "transport/link/tx/lease": settings.lease_ms,
             "transport/link/tx/keep_alive": 4,
+            # a full queue drops at once instead of holding the loop for a millisecond; in return it
+            # must hold a burst: two batches, the default, lose paced packets and any long payload
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/link/tx/queue/size/real_time": _QUEUE_BATCHES,
+            "transport/link/tx/queue/size/data_low": _QUEUE_BATCHES,
         }
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
