@@ -1,0 +1,151 @@
+"""What is Zenoh's alone: nodes, telemetry, errors. The link itself is tests/contracts/test_link."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from channel.link import LinkError
+from channel.zenoh_link import ZenohNode, ZenohSettings
+
+
+def until(condition: Callable[[], bool], deadline_s: float = 20.0) -> None:
+    end = time.monotonic() + deadline_s
+    while not condition():
+        assert time.monotonic() < end, "not within the deadline"
+        time.sleep(0.001)
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def nodes(endpoint: str) -> Iterator[tuple[ZenohNode, ZenohNode]]:
+    listening = ZenohNode(ZenohSettings(listen=(endpoint,)))
+    connecting = ZenohNode(ZenohSettings(connect=(endpoint,)))
+    yield listening, connecting
+    connecting.close()
+    listening.close()
+
+
+def test_telemetry_reaches_a_subscriber_of_a_whole_branch(
+    nodes: tuple[ZenohNode, ZenohNode],
+) -> None:
+    site, viewer = nodes
+    subscription = viewer.subscriber("session/**", capacity=16)
+    publish = site.publisher("session/local/rows")
+    payload = bytes(range(256)) * 800  # 200 kB: many fragments
+    arrived: list[tuple[str, bytes]] = []
+
+    def heard() -> bool:
+        publish(payload)
+        arrived.extend(subscription.receive())
+        return bool(arrived)
+
+    until(heard)
+    assert arrived[0] == ("session/local/rows", payload)
+    subscription.close()
+    subscription.close()
+    assert subscription.receive() == []
+
+
+def test_a_run_that_ends_late_does_not_hide_its_successor(
+    nodes: tuple[ZenohNode, ZenohNode], endpoint: str
+) -> None:
+    listening, first_run = nodes
+    link = listening.link("s/local", "s/remote")
+    old = first_run.link("s/remote", "s/local")
+    until(link.peer_present)
+    second_run = ZenohNode(ZenohSettings(connect=(endpoint,)))
+    new = second_run.link("s/remote", "s/local")
+    until(new.peer_present)
+    until(lambda: link.peer_present() and len(link._present) == 2)
+    old.close()
+    until(lambda: (link.peer_present(), len(link._present))[1] == 1)
+    assert link.peer_present()
+    second_run.close()
+    until(lambda: not link.peer_present())
+
+
+def test_everything_on_a_closed_node_is_quiet(endpoint: str) -> None:
+    node = ZenohNode(ZenohSettings(listen=(endpoint,)))
+    link, publish = node.link("a", "b"), node.publisher("c")
+    subscription = node.subscriber("d", 1)
+    node.close()
+    node.close()
+    publish(b"x")
+    assert not link.send(b"x")
+    assert link.receive() == []
+    assert not link.peer_present()
+    assert subscription.receive() == []
+    link.close()
+    with pytest.raises(LinkError, match="declare"):
+        node.link("a", "b")
+
+
+def test_a_taken_port_is_named(endpoint: str) -> None:
+    node = ZenohNode(ZenohSettings(listen=(endpoint,)))
+    with pytest.raises(LinkError, match=endpoint) as raised:
+        ZenohNode(ZenohSettings(listen=(endpoint,)))
+    assert "in use" in str(raised.value)
+    assert "a port no other program has" in str(raised.value)
+    node.close()
+
+
+@pytest.mark.parametrize("bad", ["nonsense", "tcp/127.0.0.1:port"])
+def test_a_bad_endpoint_is_named(bad: str) -> None:
+    with pytest.raises(LinkError, match=bad):
+        ZenohNode(ZenohSettings(listen=(bad,)))
+
+
+def test_an_unreachable_peer_is_no_error() -> None:
+    ZenohNode(ZenohSettings(connect=("tcp/127.0.0.1:1",))).close()
+
+
+def test_nowhere_to_meet_is_an_error() -> None:
+    with pytest.raises(LinkError, match="nowhere to meet"):
+        ZenohNode(ZenohSettings())
+
+
+def test_a_users_own_configuration_is_used(tmp_path: Path, endpoint: str) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(
+        '{mode: "peer", scouting: {multicast: {enabled: false}}, '
+        f'listen: {{endpoints: ["{endpoint}"]}}}}'
+    )
+    own = ZenohNode(ZenohSettings(config_file=str(file)))
+    other = ZenohNode(ZenohSettings(connect=(endpoint,)))
+    link = own.link("a", "b")
+    other.link("b", "a")
+    until(link.peer_present)
+    other.close()
+    own.close()
+
+
+def test_given_endpoints_override_the_users_configuration(tmp_path: Path, endpoint: str) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{mode: "peer", listen: {endpoints: ["tcp/192.0.2.1:7447"]}}')
+    with pytest.raises(LinkError):
+        ZenohNode(ZenohSettings(config_file=str(file)))
+    ZenohNode(ZenohSettings(listen=(endpoint,), config_file=str(file))).close()
+
+
+def test_a_missing_or_broken_configuration_file_is_named(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.json5"
+    with pytest.raises(LinkError, match="does not exist"):
+        ZenohNode(ZenohSettings(config_file=str(missing)))
+    broken = tmp_path / "broken.json5"
+    broken.write_text("{listen: ")
+    with pytest.raises(LinkError, match="broken"):
+        ZenohNode(ZenohSettings(config_file=str(broken)))
+
+
+def test_lease_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="lease_ms = 0"):
+        ZenohSettings(lease_ms=0)
