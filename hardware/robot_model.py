@@ -98,12 +98,14 @@ class RobotModel:
         self._model = model
         self._frame = frame
         self._data = data = model.createData()
+        n = model.nv
         # pinocchio writes into the same memory at every call, so these views are made once.
-        self._M, self._C, self._G = data.M, data.C, data.g
-        self._axes, self._axes_dot = data.J[3:].T, data.dJ[3:].T
+        # Everywhere, reshape undoes its habit of handing out a matrix of one column as a vector.
+        self._M, self._C, self._G = data.M.reshape(n, n), data.C.reshape(n, n), data.g
+        self._axes, self._axes_dot = data.J.reshape(6, n)[3:].T, data.dJ.reshape(6, n)[3:].T
         self._points = [placement.translation for placement in list(data.oMi)[1:]]
         self._points.append(data.oMf[frame].translation)
-        self.joints: int = model.nv
+        self.joints: int = n
         self.task_dimension: int = task_dimension
         self.position_limits_rad: tuple[FloatArray, FloatArray] = (
             model.lowerPositionLimit.copy(),
@@ -121,10 +123,10 @@ class RobotModel:
         pin.computeGeneralizedGravity(model, data, q)
         pin.computeCoriolisMatrix(model, data, q, q_dot)  # last: leaves placements, J and J̇
         pin.updateFramePlacement(model, data, self._frame)
-        J = pin.getFrameJacobian(model, data, self._frame, pin.LOCAL_WORLD_ALIGNED)[:z]
-        J_dot = pin.getFrameJacobianTimeVariation(
-            model, data, self._frame, pin.LOCAL_WORLD_ALIGNED
-        )[:z]
+        frame_axes = pin.LOCAL_WORLD_ALIGNED
+        J = pin.getFrameJacobian(model, data, self._frame, frame_axes)
+        J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame, frame_axes)
+        J, J_dot = J.reshape(6, -1)[:z], J_dot.reshape(6, -1)[:z]
         origins = np.array(self._points)
         axes = self._axes.copy()
         q_dot = q_dot.copy()
@@ -149,7 +151,8 @@ class RobotModel:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return X (z,), Ẋ (z,) and J (z, n) alone."""
         model, data, z = self._model, self._data, self.task_dimension
-        J = pin.computeFrameJacobian(model, data, q, self._frame, pin.LOCAL_WORLD_ALIGNED)[:z]
+        J = pin.computeFrameJacobian(model, data, q, self._frame, pin.LOCAL_WORLD_ALIGNED)
+        J = J.reshape(6, -1)[:z]
         return self._points[-1][:z].copy(), J @ q_dot, J
 
     def forward_dynamics(
@@ -165,7 +168,7 @@ class RobotModel:
     def inverse_inertia(self, q: FloatArray) -> FloatArray:
         """Return M⁻¹ (n, n)."""
         inverse: FloatArray = pin.computeMinverse(self._model, self._data, q)
-        return inverse
+        return inverse.reshape(self.joints, self.joints)
 
     def chain(self, q: FloatArray) -> FloatArray:
         """Return the joint centres and the end effector (n + 1, 3) [m], for drawing."""
@@ -291,7 +294,8 @@ def _require_revolute(model: pin.Model, joint: int, path: Path) -> None:
 
 
 def _require_inertia(model: pin.Model, path: Path) -> None:
-    smallest = float(np.linalg.eigvalsh(pin.crba(model, model.createData(), np.zeros(model.nq)))[0])
+    M = pin.crba(model, model.createData(), np.zeros(model.nv)).reshape(model.nv, model.nv)
+    smallest = float(np.linalg.eigvalsh(M)[0])
     if smallest <= 1e-9:
         raise DeviceConfigurationError(
             f"the inertia matrix of {path} is singular (smallest eigenvalue {smallest:.2g} kg·m²): "
@@ -306,7 +310,8 @@ def _with_scalar_joints(reduced: pin.Model) -> pin.Model:
     neutral = pin.neutral(reduced)
     for joint in range(1, reduced.njoints):
         source = reduced.joints[joint]
-        axis = pin.computeJointJacobian(reduced, data, neutral, joint)[3:, source.idx_v]
+        jacobian = pin.computeJointJacobian(reduced, data, neutral, joint)
+        axis = jacobian.reshape(6, -1)[3:, source.idx_v]
         if source.nq == 1:
             limits = (
                 float(reduced.lowerPositionLimit[source.idx_q]),

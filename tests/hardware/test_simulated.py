@@ -1,0 +1,459 @@
+"""The simulated arm: its physics, its integrators, its imperfections, its time."""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from hardware.interface import ContactForce, DeviceConfigurationError, DeviceError, FloatArray
+from hardware.robot_model import PlanarArm, RobotModel, build_robot
+from hardware.simulated import SimulatedDevice, SimulatedSettings
+
+MS = 1_000_000
+
+
+class Clock:
+    """A clock that moves when told."""
+
+    def __init__(self, ns: int = 0) -> None:
+        self.ns = ns
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+class Push:
+    """A contact that keeps what it was asked."""
+
+    def __init__(self, law: Callable[[float, FloatArray, FloatArray], FloatArray]) -> None:
+        self.law = law
+        self.asked: list[tuple[float, FloatArray, FloatArray]] = []
+
+    def force_n(
+        self, time_s: float, position_m: FloatArray, velocity_m_s: FloatArray
+    ) -> FloatArray:
+        self.asked.append((time_s, position_m, velocity_m_s))
+        return self.law(time_s, position_m, velocity_m_s)
+
+
+def constant(*force_n: float) -> Push:
+    return Push(lambda t, X, X_dot: np.array(force_n))
+
+
+def wall(t: float, X: FloatArray, X_dot: FloatArray) -> FloatArray:
+    """A spring wall at x = 0.3 m, and a steady push along y."""
+    return np.array([-500.0 * max(X[0] - 0.3, 0.0), 0.4])
+
+
+def planar(joints: int, mass: str = "rod", gravity: tuple[float, float] = (0, 0)) -> RobotModel:
+    arm = PlanarArm("planar", (0.38,) * joints, (0.3,) * joints, mass, gravity)  # type: ignore[arg-type]
+    return build_robot(arm, None)
+
+
+BAR_KG_M2 = 0.3 * 0.38**2 / 3.0  # one rod about its end
+
+
+def running(
+    model: RobotModel,
+    contact: ContactForce | None = None,
+    *,
+    seed: int = 0,
+    start_ns: int = 0,
+    initial: tuple[float, ...] | None = None,
+    **options: object,
+) -> tuple[SimulatedDevice, Clock]:
+    """A device, enabled, on a clock of its own that stands at session time zero."""
+    clock = Clock(start_ns)
+    settings = SimulatedSettings(initial or (0.4,) * model.joints, **options)  # type: ignore[arg-type]
+    device = SimulatedDevice(model, settings, contact, clock, start_ns, seed)
+    device.open()
+    device.enable()
+    return device, clock
+
+
+def ticks(device: SimulatedDevice, clock: Clock, count: int, ns: int = MS) -> FloatArray:
+    """Let time pass; positions and velocities, (count, 2, n)."""
+    rows = []
+    for _ in range(count):
+        clock.ns += ns
+        state = device.read()
+        rows.append((state.position_rad, state.velocity_rad_s))
+    return np.array(rows)
+
+
+def energy_j(model: RobotModel, q: FloatArray, q_dot: FloatArray, gravity: float = 0.0) -> float:
+    """Kinetic and potential energy of an arm of uniform rods, gravity along −y."""
+    points = model.chain(q)
+    height = 0.5 * (points[1:, 1] + points[:-1, 1])
+    return float(0.5 * q_dot @ model.terms(q, q_dot).M @ q_dot + 0.3 * gravity * height.sum())
+
+
+# Physics and integrators.
+
+
+def test_a_free_swing_keeps_its_energy() -> None:
+    model = planar(3, gravity=(0.0, -9.81))
+    device, clock = running(model, integrator="rk4", initial=(0.4, 0.3, -0.2))
+    path = ticks(device, clock, 3000)
+    energies = [energy_j(model, q, q_dot, 9.81) for q, q_dot in path[::50]]
+    assert np.ptp(path[:, 0, 0]) > 1.0
+    np.testing.assert_allclose(
+        energies, energy_j(model, np.array([0.4, 0.3, -0.2]), np.zeros(3), 9.81), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(("integrator", "order"), [("semi-implicit", 1), ("rk4", 4)])
+def test_integrators_have_their_order(integrator: str, order: int) -> None:
+    model = planar(2, gravity=(0.0, -9.81))
+
+    def end(step_ms: float, method: str = integrator) -> FloatArray:
+        device, clock = running(model, integrator=method, step_s=step_ms * 1e-3)
+        return ticks(device, clock, 10, 40 * MS)[-1]
+
+    exact = end(0.25, "rk4")
+    coarse, fine = (np.abs(end(step) - exact).max() for step in (4.0, 2.0))
+    assert math.log2(coarse / fine) == pytest.approx(order, abs=0.25)
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_contact_work_equals_the_energy_gained(integrator: str) -> None:
+    model = planar(2)
+    device, clock = running(
+        model, Push(wall), integrator=integrator, step_s=1e-4, initial=(0.2, 1.6)
+    )
+    power = []
+    for _ in range(6000):
+        clock.ns += 100_000
+        state = device.read()
+        X_dot = model.end_effector(state.position_rad, state.velocity_rad_s)[1]
+        power.append(state.wrench[:2] @ X_dot)
+    work = float(np.sum(power)) * 1e-4
+    gained = energy_j(model, state.position_rad, state.velocity_rad_s)
+    assert np.ptp(power) > 0.1
+    assert work == pytest.approx(gained, rel=2e-2)
+
+
+def test_the_wrench_is_the_force_on_the_robot_now() -> None:
+    contact = Push(lambda t, X, X_dot: np.array([t, X[0]]) + X_dot)
+    model = planar(2)
+    device, clock = running(model, contact)
+    ticks(device, clock, 30)
+    clock.ns += MS
+    state = device.read()
+    X, X_dot, _ = model.end_effector(state.position_rad, state.velocity_rad_s)
+    np.testing.assert_allclose(state.wrench[:2], np.array([0.031, X[0]]) + X_dot)
+    np.testing.assert_array_equal(state.wrench[2:], 0.0)
+    assert np.abs(X_dot).max() > 0.0
+
+
+def test_a_push_moves_the_arm_its_way() -> None:
+    model = planar(2)
+    device, clock = running(model, constant(0.0, 1.0))
+    state = ticks(device, clock, 50)[-1]
+    assert model.end_effector(*state)[1][1] > 0.0
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_torque_is_held_between_writes(integrator: str) -> None:
+    device, clock = running(planar(1), integrator=integrator)
+    device.read()
+    torque = np.array([0.01])
+    device.write(torque)
+    torque[:] = 9.0  # the caller's array is the caller's
+    velocity = ticks(device, clock, 20)[-1, 1]
+    assert velocity[0] == pytest.approx(0.01 / BAR_KG_M2 * 0.02)
+
+
+# Friction.
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_viscous_friction_slows_exponentially(integrator: str) -> None:
+    device, clock = running(planar(1), integrator=integrator, viscous_friction_nm_s=0.05)
+    device.write(np.array([0.1]))
+    before = ticks(device, clock, 100)[-1, 1, 0]
+    device.write(np.zeros(1))
+    after = ticks(device, clock, 200)[-1, 1, 0]
+    expected = math.exp(-0.05 / BAR_KG_M2 * 0.2)
+    assert after / before == pytest.approx(expected, rel=5e-3)
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_coulomb_friction_stops_a_bar_in_the_textbook_time(integrator: str) -> None:
+    friction = 0.02
+    device, clock = running(planar(1), integrator=integrator, coulomb_friction_nm=friction)
+    device.write(np.array([0.1]))
+    position, velocity = ticks(device, clock, 100)[-1, :, 0]
+    assert velocity == pytest.approx((0.1 - friction) / BAR_KG_M2 * 0.1)
+    device.write(np.zeros(1))
+    deceleration = friction / BAR_KG_M2
+    stop_ticks = math.ceil(velocity / deceleration * 1e3)
+    path = ticks(device, clock, stop_ticks + 200)[:, :, 0]
+    travelled = path[-1, 0] - position
+    assert travelled == pytest.approx(velocity**2 / (2.0 * deceleration), rel=1e-2)
+    assert (path[:, 1] >= -1e-15).all()  # it never turns round
+    assert abs(path[stop_ticks - 2, 1]) > 1e-3
+    np.testing.assert_allclose(path[stop_ticks:, 1], 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_coulomb_friction_lets_go_just_above_its_limit(integrator: str) -> None:
+    for torque, moves in ((0.0199, False), (0.0201, True)):
+        device, clock = running(planar(1), integrator=integrator, coulomb_friction_nm=0.02)
+        device.write(np.array([torque]))
+        travelled = float(ticks(device, clock, 500)[-1, 0, 0]) - 0.4
+        assert (travelled > 1e-4) is moves
+        assert moves or abs(travelled) < 1e-15
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_coulomb_friction_holds_an_arm_against_gravity(integrator: str) -> None:
+    model = planar(3, gravity=(0.0, -9.81))
+    load = np.abs(model.terms(np.full(3, 0.4), np.zeros(3)).G).max()
+    device, clock = running(model, integrator=integrator, coulomb_friction_nm=1.2 * load)
+    path = ticks(device, clock, 1000)
+    np.testing.assert_allclose(path[:, 0], 0.4, atol=2e-4)
+    # Once found, the holding torque is exact: no creep.
+    np.testing.assert_allclose(path[-1, 0], path[200, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_coulomb_friction_only_takes_energy_until_all_is_still(integrator: str) -> None:
+    model = planar(3, "point")
+    device, clock = running(model, integrator=integrator, coulomb_friction_nm=0.1)
+    device.write(np.array([0.8, -0.4, 0.6]))
+    ticks(device, clock, 40)
+    device.write(np.zeros(3))
+    path = ticks(device, clock, 1500)
+    energies = np.array(
+        [0.5 * q_dot @ model.terms(q, q_dot).M @ q_dot for q, q_dot in path],
+    )
+    assert energies[0] > 0.01
+    assert np.diff(energies).max() < 1e-9
+    assert np.abs(path[-1, 1]).max() < 1e-12
+
+
+# Imperfect sensors and actuators.
+
+
+def test_encoders_count_in_whole_steps() -> None:
+    exact, exact_clock = running(planar(2))
+    coarse, coarse_clock = running(planar(2), encoder_resolution_rad=1e-3)
+    for device in (exact, coarse):
+        device.write(np.array([0.05, -0.02]))
+    truth, measured = ticks(exact, exact_clock, 200), ticks(coarse, coarse_clock, 200)
+    counts = measured[:, 0] / 1e-3
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+    assert np.abs(measured[:, 0] - truth[:, 0]).max() <= 0.5e-3 * (1.0 + 1e-9)
+    assert len(np.unique(counts[:, 0])) > 20
+
+
+def test_encoder_velocity_is_a_filtered_difference() -> None:
+    device, clock = running(planar(1), encoder_resolution_rad=1e-2, velocity_filter_s=0.003)
+    first = device.read()
+    device.write(np.array([1.0]))
+    path = np.concatenate([[[first.position_rad, first.velocity_rad_s]], ticks(device, clock, 50)])[
+        :, :, 0
+    ]
+    assert path[0, 1] == 0.0
+    expected = 0.0
+    for (before, _), (after, velocity) in itertools.pairwise(path):
+        expected += 0.001 / (0.001 + 0.003) * ((after - before) / 0.001 - expected)
+        assert velocity == pytest.approx(expected, abs=1e-9)
+    assert np.ptp(path[:, 1]) > 1.0
+
+
+def test_reading_twice_at_one_instant_changes_nothing() -> None:
+    device, clock = running(planar(2), constant(1.0, 0.0), encoder_resolution_rad=1e-4)
+    ticks(device, clock, 20)
+    one, two = device.read(), device.read()
+    np.testing.assert_array_equal(one.position_rad, two.position_rad)
+    np.testing.assert_array_equal(one.velocity_rad_s, two.velocity_rad_s)
+    assert one.stamp_ns == two.stamp_ns
+
+
+def test_actuators_saturate() -> None:
+    device, clock = running(planar(1), torque_limit_nm=0.01)
+    device.write(np.array([5.0]))
+    assert ticks(device, clock, 1)[-1, 1, 0] == pytest.approx(0.01 / BAR_KG_M2 * 0.001)
+    device.write(np.array([-5.0]))
+    assert ticks(device, clock, 1)[-1, 1, 0] == pytest.approx(0.0, abs=1e-15)
+
+
+def test_noise_has_the_size_asked_for() -> None:
+    device, clock = running(planar(2), velocity_noise_rad_s=0.2, force_noise_n=0.5)
+    states = []
+    for _ in range(2000):
+        clock.ns += MS
+        states.append(device.read())
+    velocity = np.array([state.velocity_rad_s for state in states])
+    wrench = np.array([state.wrench for state in states])
+    assert velocity.std() == pytest.approx(0.2, rel=0.1)
+    assert wrench[:, :2].std() == pytest.approx(0.5, rel=0.1)
+    np.testing.assert_array_equal(wrench[:, 2:], 0.0)
+    np.testing.assert_array_equal([state.position_rad for state in states], 0.4)  # not felt
+
+
+# Lifecycle.
+
+
+def test_brakes_hold_the_arm_while_outputs_are_off() -> None:
+    device, clock = running(planar(2), constant(5.0, 5.0))
+    moving = ticks(device, clock, 50)[-1]
+    assert np.abs(moving[1]).max() > 0.1
+    device.stop()
+    held = ticks(device, clock, 50)
+    np.testing.assert_array_equal(held[:, 0], np.broadcast_to(moving[0], (50, 2)))
+    np.testing.assert_array_equal(held[:, 1], 0.0)
+    assert device.read().wrench[0] == 5.0  # still felt
+
+
+def test_without_brakes_the_arm_drifts_at_zero_torque() -> None:
+    device, clock = running(planar(1), brakes=False)
+    device.write(np.array([0.1]))
+    velocity = ticks(device, clock, 50)[-1, 1, 0]
+    device.stop()
+    drift = ticks(device, clock, 50)[:, 1, 0]
+    np.testing.assert_array_equal(drift, velocity)
+
+
+def test_time_before_enable_is_not_lived_after_it() -> None:
+    clock = Clock()
+    device = SimulatedDevice(
+        planar(1), SimulatedSettings((0.4,)), constant(0.0, 1.0), clock, 0, seed=0
+    )
+    device.open()
+    clock.ns += 30 * MS
+    device.enable()
+    np.testing.assert_array_equal(device.read().position_rad, [0.4])
+    assert device.skipped_ns == 0
+
+
+def test_reopening_starts_afresh() -> None:
+    device, clock = running(planar(2), constant(1.0, 2.0), velocity_noise_rad_s=0.1)
+    first = ticks(device, clock, 20)
+    device.close()
+    device.open()
+    device.enable()
+    clock.ns += 0
+    np.testing.assert_array_equal(ticks(device, clock, 20), first)
+
+
+def test_opening_twice_is_an_error() -> None:
+    device, _ = running(planar(1))
+    with pytest.raises(DeviceError, match="already open"):
+        device.open()
+
+
+# Time.
+
+
+@pytest.mark.parametrize(
+    ("elapsed_ns", "steps"),
+    [(0, 0), (1, 1), (MS, 1), (MS + 1, 2), (2 * MS, 2), (7 * MS, 7), (50 * MS, 50), (90 * MS, 50)],
+)
+@pytest.mark.parametrize("start_ns", [0, 3_141_592_653_589_793])
+def test_one_clock_step_is_one_integration_step(elapsed_ns: int, steps: int, start_ns: int) -> None:
+    contact = constant(0.0, 0.0)
+    device, clock = running(planar(2), contact, start_ns=start_ns)
+    clock.ns += elapsed_ns
+    device.read()
+    assert len(contact.asked) == steps + 1  # one more for the wrench
+
+
+def test_semi_implicit_step_is_exactly_the_formula() -> None:
+    model = planar(3, "point")
+    device, clock = running(model)
+    device.write(np.array([0.3, -0.1, 0.2]))
+    q, q_dot = np.full(3, 0.4), np.zeros(3)
+    for position, velocity in ticks(device, clock, 100):
+        q_dot = q_dot + 0.001 * model.forward_dynamics(q, q_dot, np.array([0.3, -0.1, 0.2]))
+        q = q + 0.001 * q_dot
+        np.testing.assert_array_equal(position, q)
+        np.testing.assert_array_equal(velocity, q_dot)
+
+
+def test_a_long_wait_is_cut_and_counted() -> None:
+    late, late_clock = running(planar(2), constant(1.0, 0.0))
+    prompt, prompt_clock = running(planar(2), constant(1.0, 0.0))
+    late_clock.ns += 1050 * MS
+    np.testing.assert_array_equal(late.read().position_rad, ticks(prompt, prompt_clock, 50)[-1, 0])
+    assert (late.skipped_ns, prompt.skipped_ns) == (1000 * MS, 0)
+    late.stop()
+    late_clock.ns += 1050 * MS
+    late.read()
+    assert late.skipped_ns == 1000 * MS  # braked time is not simulated, so none is lost
+
+
+def test_contact_sees_session_time() -> None:
+    contact = constant(0.0, 0.0)
+    start_ns = 5_000_000_000_123
+    device, clock = running(planar(2), contact, start_ns=start_ns)
+    ticks(device, clock, 2, 2 * MS)
+    times = [time_s for time_s, _, _ in contact.asked]
+    assert times == pytest.approx([0.0, 0.001, 0.002, 0.002, 0.003, 0.004], abs=1e-15)
+
+
+def test_runs_repeat_bit_for_bit() -> None:
+    def run(seed: int) -> FloatArray:
+        device, clock = running(
+            planar(3),
+            Push(wall),
+            seed=seed,
+            coulomb_friction_nm=0.01,
+            viscous_friction_nm_s=0.001,
+            encoder_resolution_rad=1e-4,
+            velocity_noise_rad_s=0.01,
+        )
+        rows = []
+        for _ in range(300):
+            clock.ns += MS
+            state = device.read()
+            device.write(-0.05 * state.velocity_rad_s)  # noise enters the motion
+            rows.append(np.concatenate([state.position_rad, state.velocity_rad_s, state.wrench]))
+        return np.array(rows)
+
+    np.testing.assert_array_equal(run(7), run(7))
+    assert (run(7) != run(8)).any()
+
+
+def test_divergence_is_reported_and_the_last_sane_state_kept() -> None:
+    device, clock = running(planar(2))
+    device.write(np.array([1e9, 0.0]))
+    clock.ns += 3 * MS
+    with pytest.raises(DeviceError, match=r"diverged at 0\.000 s"):
+        device.read()
+    device.stop()
+    np.testing.assert_array_equal(device.read().position_rad, [0.4, 0.4])
+
+
+# Settings.
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"initial_position_rad": (math.nan,)}, "initial_position_rad"),
+        ({"step_s": 0.0}, r"step_s is 0\.0"),
+        ({"step_s": 0.1}, "step_s"),
+        ({"coulomb_friction_nm": -1.0}, r"coulomb_friction_nm is -1\.0"),
+        ({"velocity_noise_rad_s": math.inf}, "velocity_noise_rad_s"),
+        ({"torque_limit_nm": 0.0}, "torque_limit_nm"),
+        ({"torque_limit_nm": math.nan}, "torque_limit_nm"),
+    ],
+)
+def test_impossible_settings_are_refused(change: dict[str, object], message: str) -> None:
+    good: dict[str, object] = {"driver": "simulated", "initial_position_rad": (0.1,)}
+    with pytest.raises(DeviceConfigurationError, match=message):
+        SimulatedSettings(**(good | change))  # type: ignore[arg-type]
+    # A schema validator tells the same story.
+    with pytest.raises(ValidationError, match=message):
+        TypeAdapter(SimulatedSettings).validate_python(good | change)
+
+
+def test_the_initial_position_must_fit_the_robot() -> None:
+    with pytest.raises(DeviceConfigurationError, match="has 3 angles, the robot has 2 joints"):
+        SimulatedDevice(planar(2), SimulatedSettings((0.0,) * 3), None, Clock(), 0, seed=0)
