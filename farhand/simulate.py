@@ -60,7 +60,7 @@ def _simulate(session: Session, duration_s: float) -> Run:
 
 
 def _provenance(session: Session) -> dict[str, str]:
-    """What it takes to repeat the run."""
+    """Tell what it takes to repeat the run."""
     versions = {name: version(name) for name in ("farhand", "numpy", "pin")}
     return {
         "session": session.text,

@@ -1,1 +1,1 @@
-"""One tick and what carries it: site, clock, supervisor, guard, real-time settings, session file."""
+"""One tick and what carries it: site, clock, supervisor, guard, real time, session file."""

@@ -36,7 +36,7 @@ class Site:
     """Device, channel, controller, supervisor and guard of one side of the teleoperation.
 
     The same object runs in a daemon on a steady clock and in simulation on a manual one.
-    `certified_round_trip_s` is what the gains are proven for, `obstacles_m` are the centres, (z,) each.
+    `certified_round_trip_s` is what the gains are proven for; `obstacles_m`, centres (z,) each.
     """
 
     def __init__(
