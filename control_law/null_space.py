@@ -21,7 +21,8 @@ def project(J: FloatArray, v: FloatArray, regularisation: float = 0.0) -> FloatA
     value where w = 0 (ZeroDivisionError).
     """
     w, adjugate = gram_adjugate(J)
-    return (w * v - (adjugate @ (J @ v)) @ J) / (w + regularisation)
+    scale = 1.0 / (w + regularisation)
+    return (w * v - (adjugate @ (J @ v)) @ J) * scale
 
 
 def null_space_velocity(
