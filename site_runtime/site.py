@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import nan
+from math import dist, nan
 
 import numpy as np
 import numpy.typing as npt
@@ -168,6 +168,8 @@ class Site:
         target_m = self._supervisor.target_m
         if peer is not None and peer.round_trip_ns is not None:
             self.round_trip_s = peer.round_trip_ns * 1e-9
+        if target_m is not None:
+            self.error_m = dist(terms.X, target_m)
         counters = self.channel.counters
         self.telemetry.put(
             stamp_ns=now_ns,
