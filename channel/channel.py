@@ -17,7 +17,7 @@ FloatArray = npt.NDArray[np.float64]
 _MISMATCH_SHOWN_NS = 1_000_000_000  # for people: long enough to be read, short enough to clear
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PeerSample:
     """The peer's sample in use at a tick; vectors (z,) in base axes, read-only.
 

@@ -49,7 +49,7 @@ class PacketError(Exception):
         self.reason = reason
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Packet:
     """One packet; vectors (z,) in base axes, z = 2 or 3, read-only.
 
