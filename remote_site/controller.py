@@ -45,7 +45,5 @@ class RemoteController:
         self, sub_task: SubTask, terms: RobotTerms, engaged_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """ζ and ζ̇ of (4), the sub-task's gradient ramped in."""
-        g, g_dot = ramped(
-            *sub_task.evaluate(terms), smooth_ramp(engaged_s, self.sub_task_ramp_s)
-        )
+        g, g_dot = ramped(*sub_task.evaluate(terms), smooth_ramp(engaged_s, self.sub_task_ramp_s))
         return null_space_velocity(terms.J, terms.J_dot, g, g_dot, self.regularisation)

@@ -28,9 +28,7 @@ SessionPath: TypeAlias = Annotated[
 ]
 Connect: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option(
-        "--connect", help="Zenoh endpoint to reach, e.g. tcp/B.example:7447; repeatable."
-    ),
+    typer.Option("--connect", help="Zenoh endpoint to reach, e.g. tcp/B.example:7447; repeatable."),
 ]
 Listen: TypeAlias = Annotated[
     list[str] | None,
