@@ -70,7 +70,7 @@ def demo(
             except KeyboardInterrupt:
                 pass
         if screenshot is not None:
-            draw_screenshot(screenshot, picture_of(loaded), recent)
+            draw_screenshot(screenshot, picture_of(loaded), list(recent))
             ERR.print(f"drawn: {screenshot}")
 
 

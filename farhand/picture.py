@@ -10,7 +10,7 @@ from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of, robot_of
 from site_runtime.session import Session
 from site_runtime.supervisor import State
-from telemetry.dashboard import (
+from telemetry.picture import (
     LOCAL_COLOUR,
     REMOTE_COLOUR,
     Colour,
