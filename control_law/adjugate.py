@@ -9,12 +9,7 @@ FloatArray = npt.NDArray[np.float64]
 def gram_adjugate(J: FloatArray) -> tuple[float, FloatArray]:
     """Return w = det(JJᵀ) and adj(JJᵀ), (z, z), for z = 2 or 3."""
     gram = J @ J.T
-    if len(gram) == 2:
-        adjugate = _adjugate_2(gram)
-    elif len(gram) == 3:
-        adjugate = 0.5 * _adjugate_polar_3(gram, gram)
-    else:
-        raise ValueError(f"a task of dimension {len(gram)} has no closed form here: use 2 or 3")
+    adjugate = _adjugate(gram)
     return float(gram[0].dot(adjugate[0])), adjugate
 
 
@@ -22,15 +17,23 @@ def gram_adjugate_rate(
     J: FloatArray, J_dot: FloatArray
 ) -> tuple[float, float, FloatArray, FloatArray]:
     """Return w, ẇ, adj(JJᵀ) and its time derivative, for z = 2 or 3."""
-    w, adjugate = gram_adjugate(J)
+    gram = J @ J.T
     half = J_dot @ J.T
     gram_dot = half + half.T
-    if len(gram_dot) == 2:
-        adjugate_dot = _adjugate_2(gram_dot)
-    else:
-        adjugate_dot = _adjugate_polar_3(J @ J.T, gram_dot)
+    adjugate = _adjugate(gram)
+    w = float(gram[0].dot(adjugate[0]))
     w_dot = float(np.vdot(adjugate, gram_dot))  # Jacobi's formula
-    return w, w_dot, adjugate, adjugate_dot
+    if len(gram) == 2:
+        return w, w_dot, adjugate, _adjugate_2(gram_dot)
+    return w, w_dot, adjugate, _adjugate_polar_3(gram, gram_dot)
+
+
+def _adjugate(B: FloatArray) -> FloatArray:
+    if len(B) == 2:
+        return _adjugate_2(B)
+    if len(B) == 3:
+        return 0.5 * _adjugate_polar_3(B, B)
+    raise ValueError(f"a task of dimension {len(B)} has no closed form here: use 2 or 3")
 
 
 def _adjugate_2(B: FloatArray) -> FloatArray:

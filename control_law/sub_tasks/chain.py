@@ -1,4 +1,9 @@
-"""Kinematics of a revolute chain that several sub-tasks share."""
+"""Kinematics of a revolute chain that several sub-tasks share.
+
+Vectors are plain three-tuples or lists: for a handful of joints they cost a fraction of arrays.
+"""
+
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -6,60 +11,72 @@ import numpy.typing as npt
 from control_law.terms import Terms
 
 FloatArray = npt.NDArray[np.float64]
-
-_NEXT = np.array((1, 2, 0))
-
-
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a×b along the last axis, (..., 3); np.cross costs several times more."""
-    swapped: FloatArray = a * b.take(_NEXT, -1)
-    swapped -= a.take(_NEXT, -1) * b
-    return swapped.take(_NEXT, -1)
+Vector = Sequence[float]  # of three
 
 
-def row_dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the dot products of matching rows, (r,)."""
-    products: FloatArray = np.einsum("ij,ij->i", a, b)
-    return products
+def dot(a: Vector, b: Vector) -> float:
+    """Return a·b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def from_here_on(rows: FloatArray) -> FloatArray:
-    """Return Σ_{k≥i} rows_k along the last axis but one."""
-    return rows[..., ::-1, :].cumsum(-2)[..., ::-1, :]
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return a×b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-def pulled_joints(
-    terms: Terms,
-    points: FloatArray,
-    points_dot: FloatArray,
-    pull: FloatArray,
-    pull_dot: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return g = Σ_i J_iᵀ φ_i and ġ, (n,), for a pull φ_i at a point x_i of every link i.
-
-    All arguments (n, 3). Column k of J_i is a_k×(x_i − o_k) for k ≤ i, so that
-    g_k = a_k·Σ_{i≥k}(x_i − o_k)×φ_i. A point may slide along its link; its velocity then
-    counts the sliding.
-    """
-    moment, moment_a, moment_b = cross(
-        np.array((points, points_dot, points)), np.array((pull, pull, pull_dot))
-    )
-    totals = from_here_on(np.array((pull, pull_dot, moment, moment_a + moment_b)))
-    force, force_dot, torque, torque_dot = totals
-    origins, origins_dot = terms.origins[:-1], terms.origins_dot[:-1]
-    lever, lever_a, lever_b = cross(
-        np.array((origins, origins_dot, origins)), np.array((force, force, force_dot))
-    )
-    about = torque - lever
-    g = row_dot(terms.axes, about)
-    g_dot = row_dot(terms.axes_dot, about) + row_dot(terms.axes, torque_dot - lever_a - lever_b)
-    return g, g_dot
+def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
+    """Return a + scale·b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 
-def center_3d(center: FloatArray) -> FloatArray:
-    """Return a centre (3,) from (3,) or from (2,), which lies in the plane of the base."""
-    if center.shape == (2,):
-        return np.append(center, 0.0)
-    if center.shape == (3,):
-        return center
-    raise ValueError(f"center {center} must have 2 or 3 coordinates")
+def scaled(scale: float, a: Vector) -> Vector:
+    """Return scale·a."""
+    return scale * a[0], scale * a[1], scale * a[2]
+
+
+def minus(a: Vector, b: Vector) -> Vector:
+    """Return a − b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+class JointPull:
+    """g = Σ J_iᵀφ_i and ġ, gathered from pulls φ_i at points x_i of the links."""
+
+    def __init__(self, terms: Terms) -> None:
+        self._joints = list(
+            zip(
+                terms.axes.tolist(),
+                terms.axes_dot.tolist(),
+                terms.origins.tolist(),
+                terms.origins_dot.tolist(),
+                strict=False,  # the last origin is the end effector
+            )
+        )
+        self._g = [0.0] * len(self._joints)
+        self._g_dot = [0.0] * len(self._joints)
+
+    def add(self, link: int, x: Vector, x_dot: Vector, pull: Vector, pull_dot: Vector) -> None:
+        """Add a pull φ, φ̇ at a point x, ẋ of a link, counted from 0.
+
+        Column k of J is a_k×(x − o_k), k ≤ link. If x slides along the link, ẋ counts the sliding.
+        """
+        for k, (axis, axis_dot, origin, origin_dot) in enumerate(self._joints[: link + 1]):
+            arm = minus(x, origin)
+            column = cross(axis, arm)
+            column_dot = plus(cross(axis_dot, arm), cross(axis, minus(x_dot, origin_dot)))
+            self._g[k] += dot(column, pull)
+            self._g_dot[k] += dot(column_dot, pull) + dot(column, pull_dot)
+
+    def result(self) -> tuple[FloatArray, FloatArray]:
+        """Return g and ġ, (n,)."""
+        return np.array(self._g), np.array(self._g_dot)
+
+
+def center_3d(center: FloatArray) -> tuple[float, float, float]:
+    """Return a centre of three coordinates from (3,), or from (2,): in the plane of the base."""
+    if center.shape not in ((2,), (3,)):
+        raise ValueError(f"center {center} must have 2 or 3 coordinates")
+    x, y, z = (*center.tolist(), 0.0)[:3]
+    return x, y, z

@@ -1,11 +1,12 @@
 """Obstacle avoidance for whole links, bounded everywhere."""
 
 from dataclasses import dataclass, field
+from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
 
-from control_law.sub_tasks.chain import center_3d, pulled_joints, row_dot
+from control_law.sub_tasks.chain import JointPull, center_3d, dot, minus, plus, scaled
 from control_law.sub_tasks.obstacle_distance import closest_parameter
 from control_law.terms import Terms
 
@@ -30,7 +31,7 @@ class SegmentAvoidance:
     center: FloatArray
     activation_distance_m: float
     gain: float
-    _center: FloatArray = field(init=False, repr=False)
+    _center: tuple[float, float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.activation_distance_m > 0:
@@ -41,28 +42,26 @@ class SegmentAvoidance:
 
     def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
         """Return g and ġ, (n,)."""
-        starts, links = terms.origins[:-1], np.diff(terms.origins, axis=0)
-        along = closest_parameter(terms.origins, self._center)
-        points = starts + along[:, None] * links
-        offset = points - self._center
+        joint_pull = JointPull(terms)
+        origins, origins_dot = terms.origins.tolist(), terms.origins_dot.tolist()
         core = _CORE * self.activation_distance_m
-        distance = np.sqrt(row_dot(offset, offset) + core * core)
-        depth = self.activation_distance_m - distance
-        if not (depth > 0).any():
-            return np.zeros_like(distance), np.zeros_like(distance)
-        depth = depth.clip(0.0)
-
-        starts_dot, links_dot = terms.origins_dot[:-1], np.diff(terms.origins_dot, axis=0)
-        points_dot = starts_dot + along[:, None] * links_dot
-        # The contact point slides along its link; a link's length is constant, so λ̇ has one term.
-        slides = (along > 0.0) & (along < 1.0)
-        sliding = -(row_dot(links_dot, offset) + row_dot(links, points_dot))
-        along_dot = np.where(slides, sliding / np.where(slides, row_dot(links, links), 1.0), 0.0)
-        points_dot += along_dot[:, None] * links
-
-        slope = self.gain * depth * depth / distance  # pull = −∇V = slope·offset
-        curvature = -(2.0 * self.gain * depth + slope) / (distance * distance)
-        pull = slope[:, None] * offset
-        growth = curvature * row_dot(offset, points_dot)
-        pull_dot = slope[:, None] * points_dot + growth[:, None] * offset
-        return pulled_joints(terms, points, points_dot, pull, pull_dot)
+        for i in range(len(origins) - 1):
+            start, link = origins[i], minus(origins[i + 1], origins[i])
+            along = closest_parameter(start, link, self._center)
+            x = plus(start, link, along)
+            offset = minus(x, self._center)
+            distance = sqrt(dot(offset, offset) + core * core)
+            depth = self.activation_distance_m - distance
+            if depth <= 0.0:
+                continue
+            link_dot = minus(origins_dot[i + 1], origins_dot[i])
+            x_dot = plus(origins_dot[i], link_dot, along)
+            if 0.0 < along < 1.0:
+                # The contact point slides; a link keeps its length, so λ̇ has no other term.
+                sliding = -(dot(link_dot, offset) + dot(link, x_dot)) / dot(link, link)
+                x_dot = plus(x_dot, link, sliding)
+            slope = self.gain * depth * depth / distance  # the pull, −∇V, is slope·offset
+            slope_dot = -(2.0 * self.gain * depth + slope) * dot(offset, x_dot) / distance**2
+            pull_dot = plus(scaled(slope, x_dot), offset, slope_dot)
+            joint_pull.add(i, x, x_dot, scaled(slope, offset), pull_dot)
+        return joint_pull.result()

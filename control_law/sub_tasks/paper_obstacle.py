@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from control_law.sub_tasks.chain import center_3d, pulled_joints, row_dot
+from control_law.sub_tasks.chain import JointPull, center_3d, dot, minus, plus, scaled
 from control_law.terms import Terms
 
 FloatArray = npt.NDArray[np.float64]
@@ -25,7 +25,7 @@ class StipanovicAvoidance:
     safe_radius_m: float
     collision_radius_m: float
     gain: float
-    _center: FloatArray = field(init=False, repr=False)
+    _center: tuple[float, float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.collision_radius_m < self.safe_radius_m:
@@ -39,21 +39,21 @@ class StipanovicAvoidance:
 
     def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
         """Return g and ġ, (n,)."""
-        points = 0.5 * (terms.origins[1:] + terms.origins[:-1])
-        offset = points - self._center
-        distance2 = row_dot(offset, offset)
+        joint_pull = JointPull(terms)
+        origins, origins_dot = terms.origins.tolist(), terms.origins_dot.tolist()
         safe2, collision2 = self.safe_radius_m**2, self.collision_radius_m**2
-        acts = (distance2 > collision2) & (distance2 < safe2)
-        if not acts.any():
-            return np.zeros_like(distance2), np.zeros_like(distance2)
-        points_dot = 0.5 * (terms.origins_dot[1:] + terms.origins_dot[:-1])
-        gap = np.where(acts, distance2 - collision2, 1.0)
-        depth = np.where(acts, distance2 - safe2, 0.0)
         band = safe2 - collision2
-        scale = -4.0 * self.gain * band / gap**3
-        slope = scale * depth  # pull = −κ∇V = slope·offset
-        curvature = np.where(acts, scale - 3.0 * slope / gap, 0.0)  # d slope / d distance²
-        pull = slope[:, None] * offset
-        growth = 2.0 * curvature * row_dot(offset, points_dot)
-        pull_dot = slope[:, None] * points_dot + growth[:, None] * offset
-        return pulled_joints(terms, points, points_dot, pull, pull_dot)
+        for link in range(len(origins) - 1):
+            x = scaled(0.5, plus(origins[link], origins[link + 1]))
+            offset = minus(x, self._center)
+            distance2 = dot(offset, offset)
+            if not collision2 < distance2 < safe2:
+                continue
+            x_dot = scaled(0.5, plus(origins_dot[link], origins_dot[link + 1]))
+            gap = distance2 - collision2
+            scale = -4.0 * self.gain * band / gap**3
+            slope = scale * (distance2 - safe2)  # the pull, −κ∇V, is slope·offset
+            slope_dot = (scale - 3.0 * slope / gap) * 2.0 * dot(offset, x_dot)
+            pull_dot = plus(scaled(slope, x_dot), offset, slope_dot)
+            joint_pull.add(link, x, x_dot, scaled(slope, offset), pull_dot)
+        return joint_pull.result()

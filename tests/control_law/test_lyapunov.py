@@ -114,9 +114,9 @@ def free_motion(
     delay: Callable[..., float],
     end_s: float,
     climb: float = 0.0,
-    dt: float = 5e-4,
+    dt: float = 1e-3,
 ) -> tuple[FloatArray, FloatArray]:
-    """V every step of a 2R local and a 3R remote arm let go 25 cm apart, or so."""
+    """V every step of a 2R local and a 3R remote arm let go 57 cm apart."""
     chains = planar_chain(2), planar_chain(3)
     qs = [np.array([0.4, 1.4]), np.array([1.2, -0.7, -0.9])]
     q_dots = [np.zeros(2), np.zeros(3)]
@@ -154,13 +154,14 @@ def greatest_rise(totals: FloatArray) -> float:
     return (totals - np.minimum.accumulate(totals)).max()
 
 
-@pytest.mark.parametrize("climb", [0.0, 5.0])
-@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize(
+    ("delay", "climb"), [("constant", 0.0), ("sinusoid", 0.0), ("random", 0.0), ("random", 5.0)]
+)
 def test_never_rises_on_a_certified_free_motion(
     planar_chain: Callable[..., Any], delay: str, climb: float
 ) -> None:
     totals, errors = free_motion(planar_chain, CERTIFIED, DELAYS[delay], 1.5, climb)
-    assert greatest_rise(totals) < 1e-4 * totals[0]
+    assert greatest_rise(totals) < 1e-9 * totals[0]
     assert errors[-1] < 0.2 * errors[0]
 
 
