@@ -174,6 +174,26 @@ class TelemetryStream:
         self._missed[i] = missed
         self._count += 1
 
+    def repeat_stopped(self, *, stamp_ns: int, time_ns: int, lateness_ns: int, state: int) -> None:
+        """Write the newest row again for a site that no longer reads its device; real-time safe.
+
+        Its outputs are off: no torque, no coupling, nothing cut. Without any row, there is nothing
+        to repeat.
+        """
+        if self._count == 0:
+            return
+        i = self._count % self._capacity
+        self._ring[i] = self._ring[(self._count - 1) % self._capacity]
+        self._sequence[i] = self._count
+        self._stamp_ns[i] = stamp_ns
+        self._time_ns[i] = time_ns
+        self._lateness_ns[i] = lateness_ns
+        self._state[i] = state
+        self._cut[i] = 0
+        self._torque_nm[i] = 0.0
+        self._coupling_force_n[i] = 0.0
+        self._count += 1
+
     def flush(self) -> None:
         """Publish every full batch not yet published; nothing to do in most ticks."""
         self._forget_overwritten()
