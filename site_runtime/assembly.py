@@ -83,7 +83,7 @@ def assemble(
             n, z, identity, session.digest, surroundings.epoch, surroundings.publish
         ),
         clock=clock,
-        times=SiteTimes(session.period_ns, start_ns),
+        times=SiteTimes(session.period_ns, session.send_period_ns, start_ns),
         certified_round_trip_s=certify(session).best.round_trip_s,
         obstacles_m=tuple(np.array(obstacle.center_m) for obstacle in obstacles),
     )

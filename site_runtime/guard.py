@@ -1,4 +1,4 @@
-"""What every command passes before it reaches a device. Whatever is cut is reported."""
+"""What every reading and every command passes. Whatever is cut is reported."""
 
 from dataclasses import dataclass
 from enum import IntFlag
@@ -6,11 +6,13 @@ from enum import IntFlag
 import numpy as np
 import numpy.typing as npt
 
+from hardware.interface import DeviceState
+
 FloatArray = npt.NDArray[np.float64]
 
 
 class GuardError(Exception):
-    """A command that cannot be mended by cutting: the site goes to FAULT."""
+    """A value that cannot be mended by cutting: the site goes to FAULT."""
 
 
 class Cut(IntFlag):
@@ -39,6 +41,16 @@ class Guard:
         self._limits = limits
         self.cut = Cut.NONE
         self.counts = {Cut.TORQUE: 0, Cut.VELOCITY: 0, Cut.WORKSPACE: 0}
+
+    def reading(self, reading: DeviceState) -> None:
+        """Let a finite reading pass; raises GuardError on any other, driven or not."""
+        for name, values in (
+            ("joint position", reading.position_rad),
+            ("joint velocity", reading.velocity_rad_s),
+            ("wrench", reading.wrench),
+        ):
+            if not np.isfinite(values).all():
+                raise GuardError(f"the device read a {name} of {values}: it is not finite")
 
     def target(self, position_m: FloatArray) -> FloatArray:
         """Return the nearest point of the workspace box to the peer's point, (z,)."""

@@ -1,6 +1,7 @@
 """One site: its tick, and the run that carries it."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from math import dist, nan
 
@@ -26,9 +27,10 @@ _FAREWELL_PACKETS = 5
 
 @dataclass(frozen=True, slots=True)
 class SiteTimes:
-    """Tick period and the instant of session time zero, on the site's clock [ns]."""
+    """Tick period, time between packets, session time zero on the site's clock [ns]."""
 
     period_ns: int
+    send_period_ns: int
     session_start_ns: int
 
 
@@ -104,10 +106,11 @@ class Site:
         """One tick. Whatever goes wrong ends in the device's stop, which never raises."""
         now_ns = self._clock.now_ns()
         if self.failure is not None:
-            self._tick_in_fault(now_ns)
+            self._tick_in_fault(now_ns, lateness_ns)
             return
         try:
             reading = self._device.read()
+            self.guard.reading(reading)
             peer = self.channel.latest(now_ns)
             terms = self._robot.terms(reading.position_rad, reading.velocity_rad_s)
             state, command, torque_nm = self._supervise(now_ns, peer), self._idle, None
@@ -130,10 +133,12 @@ class Site:
         """Stop the robot, tell the peer, close the device. Never raises before the stop."""
         self._device.stop()
         self._supervisor.stop()
-        for packet in range(_FAREWELL_PACKETS):
-            self._say(self._clock.now_ns() + packet * self._times.period_ns)
-        self.telemetry.drain()
-        self._device.close()
+        try:
+            for packet in range(_FAREWELL_PACKETS):
+                self._say(self._clock.now_ns() + packet * self._times.send_period_ns)
+            self.telemetry.drain()
+        finally:
+            self._device.close()
 
     def _supervise(self, now_ns: int, peer: PeerSample | None) -> State:
         """Update the supervisor; switch the outputs on when it first engages."""
@@ -143,10 +148,17 @@ class Site:
             self._device.enable()
         return state
 
-    def _tick_in_fault(self, now_ns: int) -> None:
+    def _tick_in_fault(self, now_ns: int, lateness_ns: int) -> None:
         """Keep telling the peer and people that this site has failed; the device is stopped."""
-        self.channel.latest(now_ns)
-        self._say(now_ns)
+        with suppress(Exception):  # the link may be what failed; the first failure is the one told
+            self.channel.latest(now_ns)
+            self._say(now_ns)
+        self.telemetry.repeat_stopped(
+            stamp_ns=now_ns,
+            time_ns=now_ns - self._times.session_start_ns,
+            lateness_ns=lateness_ns,
+            state=self._supervisor.state,
+        )
         self.ticks += 1
 
     def _say(self, now_ns: int) -> None:
@@ -166,8 +178,8 @@ class Site:
         """Write this tick's row."""
         self._position_m = terms.X
         target_m = self._supervisor.target_m
-        if peer is not None and peer.round_trip_ns is not None:
-            self.round_trip_s = peer.round_trip_ns * 1e-9
+        trip_ns = None if peer is None else peer.round_trip_ns
+        self.round_trip_s = nan if trip_ns is None else trip_ns * 1e-9
         if target_m is not None:
             self.error_m = dist(terms.X, target_m)
         counters = self.channel.counters
@@ -188,7 +200,7 @@ class Site:
             coupling_force_n=command.coupling_force_n,
             peer_position_m=nan if target_m is None else target_m,
             one_way_delay_s=nan if peer is None else peer.age_ns * 1e-9,
-            round_trip_s=self.round_trip_s if peer is not None else nan,
+            round_trip_s=self.round_trip_s,
             certified_round_trip_s=self.certified_round_trip_s,
             manipulability=manipulability(terms.J),
             link_distance_m=self._nearest(segment_distance, terms.origins),
