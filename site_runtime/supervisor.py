@@ -3,7 +3,7 @@
 | from | to | when |
 |---|---|---|
 | READY | ENGAGED | peer heard, same session, two-way exchange proven, start time reached |
-| ENGAGED | HOLD | peer silent for `hold_after`, or the peer itself is offline or in fault |
+| ENGAGED | HOLD | peer silent for `hold_after`, offline, in fault, or started anew |
 | HOLD | ENGAGED | peer back, two-way exchange proven again |
 | any | FAULT | any exception; latched: only a new start leaves it |
 | any | OFFLINE | clean stop |
@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from channel.channel import PeerSample
+from channel.channel import Counters, PeerSample
 from control_law.ramp import smooth_ramp
 
 FloatArray = npt.NDArray[np.float64]
@@ -56,6 +56,11 @@ class PeerPresence(Protocol):
         """That packet answers one of this very process: a live exchange, not a recording."""
         ...
 
+    @property
+    def counters(self) -> Counters:
+        """Among them, how often another run of the peer took the place of the one heard before."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class EngagementTimes:
@@ -74,18 +79,21 @@ class Supervisor:
         self._engaged_ns = 0
         self._resumed_ns: int | None = None
         self._held: FloatArray | None = None
+        self._peer_restarts = 0
         self.state = State.READY
         self.target_m: FloatArray | None = None
 
     def update(self, now_ns: int, presence: PeerPresence, peer: PeerSample | None) -> State:
         """Take one tick's look at the peer; return the state that this tick runs in."""
         peer_fit = self._peer_fit(now_ns, presence)
+        same_peer = presence.counters.peer_restarts == self._peer_restarts
+        self._peer_restarts = presence.counters.peer_restarts
         if self.state is State.READY:
             if peer_fit and peer is not None and now_ns >= self._times.not_before_ns:
                 self.state = State.ENGAGED
                 self._engaged_ns = now_ns
         elif self.state is State.ENGAGED:
-            if not peer_fit:
+            if not (peer_fit and same_peer):
                 self.state = State.HOLD
                 self._held = self.target_m
         elif self.state is State.HOLD and peer_fit and peer is not None:
