@@ -70,7 +70,7 @@ class Device(Protocol):
         ...
 
     def enable(self) -> None:
-        """Switch the outputs on at zero torque; raises DeviceError when the device is not open."""
+        """Switch the outputs on at zero torque, also when they are on; raises DeviceError."""
         ...
 
     def read(self) -> DeviceState:

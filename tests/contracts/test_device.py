@@ -253,6 +253,9 @@ def test_enabling_starts_from_zero_torque(bench: Bench) -> None:
     bench.device.open()
     bench.device.enable()
     np.testing.assert_array_equal(bench.motor_torque_nm(), 0.0)
+    run(bench, 3)
+    bench.device.enable()  # again: harmless, and back at zero
+    np.testing.assert_array_equal(bench.motor_torque_nm(), 0.0)
 
 
 @pytest.mark.parametrize("stage", sorted(LIFECYCLE))

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -14,7 +15,7 @@ from hardware.simulated import SimulatedSettings
 
 
 @pytest.fixture
-def offer(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]  # noqa: ANN201
+def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Pretend that an installed package offers drivers."""
 
     def offer(**targets: str) -> None:
@@ -45,7 +46,9 @@ def test_an_unknown_name_is_answered_with_the_nearest(name: str) -> None:
         driver(name)
 
 
-def test_installed_packages_may_add_drivers_but_not_replace_one(offer) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
+def test_installed_packages_may_add_drivers_but_not_replace_one(
+    offer: Callable[..., None],
+) -> None:
     offer(other="hardware.simulated:DRIVER", simulated="nowhere:DRIVER")
     assert drivers() == ("other", "simulated")
     assert isinstance(driver("other"), DriverEntry)
@@ -63,7 +66,9 @@ def test_installed_packages_may_add_drivers_but_not_replace_one(offer) -> None: 
         ("hardware.simulated:SimulatedSettings", "is a type, not a DriverEntry"),
     ],
 )
-def test_a_broken_driver_is_explained(offer, target: str, message: str) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001
+def test_a_broken_driver_is_explained(
+    offer: Callable[..., None], target: str, message: str
+) -> None:
     offer(broken=target)
     assert "broken" in drivers()  # listing loads nothing
     with pytest.raises(DeviceConfigurationError, match=message):

@@ -63,7 +63,7 @@ def along_motion(robot: RobotModel, q: FloatArray, q_dot: FloatArray, name: str)
     """d/dt of one term as the arm moves on from q with q̇."""
     ahead = getattr(robot.terms(q + STEP * q_dot, q_dot), name)
     behind = getattr(robot.terms(q - STEP * q_dot, q_dot), name)
-    return (ahead - behind) / (2.0 * STEP)
+    return np.asarray((ahead - behind) / (2.0 * STEP))
 
 
 @many
@@ -413,6 +413,10 @@ def test_a_prismatic_joint_on_the_chain_is_named(tmp_path: Path) -> None:
     arm = edited(tmp_path, '"shoulder" type="revolute"', '"shoulder" type="prismatic"')
     with pytest.raises(DeviceConfigurationError, match=r"joint 'shoulder' .* is of type P"):
         build_robot(arm, None)
+
+
+def test_a_link_is_meant_where_a_joint_has_its_name(tmp_path: Path) -> None:
+    assert build_robot(edited(tmp_path, '"bend" type', '"tool" type'), None).joints == 4
 
 
 def test_a_coupled_joint_on_the_chain_is_named(tmp_path: Path) -> None:
