@@ -8,7 +8,7 @@ import json
 import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from pydantic import ValidationError
@@ -54,6 +54,8 @@ class Problem:
     value: object
     reason: str
     line: int | None = None
+    meant: str | None = None
+    """For an unknown key, the dotted key that it probably stands for."""
 
     def __str__(self) -> str:
         where = f"line {self.line}: " if self.line is not None else ""
@@ -74,7 +76,10 @@ class SessionFileError(SessionError):
 
 def keys_of(table: type) -> dict[str, Any]:
     """Return the keys of a table and their annotations."""
-    return get_type_hints(table, include_extras=True) if is_dataclass(table) else {}
+    if not is_dataclass(table):
+        return {}
+    hints = get_type_hints(table, include_extras=True)
+    return {item.name: hints[item.name] for item in fields(table)}
 
 
 def tables_of(annotation: object) -> tuple[type, ...]:
@@ -120,12 +125,19 @@ def describe(annotation: object) -> str:
 
 def explain(error: ValidationError, annotation: object, document: object) -> Iterator[Problem]:
     """Turn pydantic's findings about `document`, validated as `annotation`, into problems."""
-    seen: set[tuple[str, str]] = set()
-    for detail in error.errors(include_url=False):
-        for problem in _explain_one(detail, annotation, document):
-            if (problem.key, problem.reason) not in seen:
-                seen.add((problem.key, problem.reason))
-                yield problem
+    found = [
+        problem
+        for detail in error.errors(include_url=False)
+        for problem in _explain_one(detail, annotation, document)
+    ]
+    # A mistyped key is one problem, not also the absence of the key that was meant.
+    meant = {problem.meant for problem in found}
+    told: set[tuple[str, str]] = set()
+    for problem in found:
+        absent = problem.value is ABSENT and problem.key in meant
+        if not absent and (problem.key, problem.reason) not in told:
+            told.add((problem.key, problem.reason))
+            yield problem
 
 
 def _explain_one(detail: Mapping[str, Any], annotation: object, value: object) -> Iterator[Problem]:
@@ -157,8 +169,7 @@ def _explain_one(detail: Mapping[str, Any], annotation: object, value: object) -
             key = dotted(key, part)
     kind, cause = detail["type"], detail.get("ctx", {}).get("error")
     if kind == "unexpected_keyword_argument" and parent is not None:
-        name = str(detail["loc"][-1])
-        yield Problem(key, value, unknown_key(name, keys_of(parent)))
+        yield _unknown_key(key, str(detail["loc"][-1]), value, list(keys_of(parent)))
     elif kind == "missing":
         yield Problem(key, ABSENT, f"is missing; it must be {describe(annotation)}")
     elif isinstance(cause, NestedProblems):
@@ -178,18 +189,6 @@ class NestedProblems(ValueError):  # noqa: N818  carried through pydantic, never
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)
         super().__init__("; ".join(str(problem) for problem in problems))
-
-
-def unknown_key(name: str, valid: Mapping[str, object] | Sequence[str]) -> str:
-    """Say that `name` is not a key, which unit is meant, or which valid key is nearest."""
-    other = _other_unit(name, list(valid))
-    if other is not None:
-        unit = other[1]
-        return f"{name} is not a key; this file gives {_UNITS[unit]}: {other[0]}"
-    near = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
-    if near:
-        return f"{name} is not a key; the nearest is {near[0]}"
-    return f"{name} is not a key; allowed here: {', '.join(valid)}"
 
 
 def nearest(name: object, valid: Sequence[str]) -> str:
@@ -246,6 +245,24 @@ def _wrong_tag(
         allowed = ", ".join(_shown(name) for name in names)
         return Problem(dotted(key, tag), ABSENT, f"is missing; it must be one of {allowed}")
     return Problem(dotted(key, tag), given, nearest(given, names))
+
+
+def _unknown_key(key: str, name: str, value: object, valid: Sequence[str]) -> Problem:
+    """Say which unit is meant, or which valid key is nearest, or what is allowed."""
+    other = _other_unit(name, valid)
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    meant = None
+    if other is not None:
+        meant, unit = other
+        advice = f"this file gives {_UNITS[unit]}: {meant}"
+    elif near:
+        meant = near[0]
+        advice = f"the nearest is {meant}"
+    else:
+        advice = f"allowed here: {', '.join(valid)}"
+    table = key[: len(key) - len(dotted("", name))]
+    full = None if meant is None else f"{table}{meant}"
+    return Problem(key, value, f"{name} is not a key; {advice}", meant=full)
 
 
 def _other_unit(name: str, valid: Sequence[str]) -> tuple[str, str] | None:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 from pydantic import ConfigDict, Field, PlainValidator, TypeAdapter, ValidationError
 
 from channel.delay import ConstantDelay, Direction
+from hardware.interface import DeviceConfigurationError
 from hardware.registry import driver, drivers
 from hardware.robot_model import RobotDescription
 from site_runtime.real_time import RealTimeSettings
@@ -142,10 +143,15 @@ def _device(table: object) -> DeviceSettings:
     if name is ABSENT:
         allowed = ", ".join(f'"{known}"' for known in drivers())
         raise NestedProblems([Problem(".driver", ABSENT, f"is missing; one of {allowed}")])
-    if name not in drivers():
-        raise NestedProblems([Problem(".driver", name, nearest(name, list(drivers())))])
+    if not isinstance(name, str):
+        raise NestedProblems([Problem(".driver", name, nearest(name, drivers()))])
+    try:
+        entry = driver(name)
+    except DeviceConfigurationError as error:
+        reason = str(error) if name in drivers() else nearest(name, drivers())
+        raise NestedProblems([Problem(".driver", name, reason)]) from None
     # A tuple, since it may carry the strict configuration to a class that knows no pydantic.
-    annotation: Any = GenericAlias(tuple, (driver(name).settings,))
+    annotation: Any = GenericAlias(tuple, (entry.settings,))
     try:
         settings: DeviceSettings = TypeAdapter(annotation, config=_STRICT).validate_json(
             json.dumps([table])

@@ -1,0 +1,147 @@
+"""The session files that come with farhand: valid, certified, and what they claim to be."""
+
+import re
+from math import inf, pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from channel.delay import SinusoidDelay
+from control_law.sub_tasks.obstacle_distance import segment_distance
+from site_runtime.certification import certify, sampling_ratio
+from site_runtime.keys import SiteId
+from site_runtime.parts import robot_of
+from site_runtime.session import HumanArmOperator, load_session, parse_session
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+FILES = sorted(FOLDER.glob("*.toml"))
+PAPER = [path for path in FILES if path.stem.startswith("paper_")]
+NUMBER = re.compile(r"(?<![\w.\"/:])-?\d+\.\d+(e-?\d+)?(?![\w.:\"])")
+
+
+def start(session, site):
+    robot = robot_of(session, site)
+    q = np.array(session.site(site).device.initial_position_rad)
+    return robot.terms(q, np.zeros(robot.joints))
+
+
+def test_the_files_are_there():
+    assert {path.stem for path in FILES} >= {
+        *("paper_free", "paper_singularity", "paper_obstacle", "theorem_b", "demo", "seven_dof")
+    }
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_loads_and_is_named_after_itself(path):
+    assert load_session(path).name == path.stem
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_comments_and_blank_lines_keep_the_digest(path):
+    text = path.read_text(encoding="utf-8")
+    stripped = re.sub(r"(?m)\s*#.*$", "", text)
+    assert stripped != text
+    spaced = "# another comment\n" + text.replace("\n[", "\n\n\n[")
+    digests = {parse_session(version, path).digest for version in (text, stripped, spaced)}
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize("path", [FOLDER / "demo.toml", FOLDER / "paper_singularity.toml"])
+def test_any_number_changed_changes_the_digest(path):
+    text = path.read_text(encoding="utf-8")
+    digest = parse_session(text, path).digest
+    seen = 0
+    for number in NUMBER.finditer(text):
+        line = text[text.rfind("\n", 0, number.start()) + 1 : number.start()]
+        if "#" in line:
+            continue
+        changed = str(float(number[0]) * 0.99 + (1e-3 if float(number[0]) == 0.0 else 0.0))
+        mutated = text[: number.start()] + changed + text[number.end() :]
+        assert parse_session(mutated, path).digest != digest, line
+        seen += 1
+    assert seen > 20
+
+
+@pytest.mark.parametrize("path", [*PAPER, FOLDER / "theorem_b.toml"], ids=lambda path: path.stem)
+def test_the_setting_of_section_vi(path):
+    session = load_session(path)
+    assert session.channel.injection == "exact"
+    for direction in (session.channel.local_to_remote, session.channel.remote_to_local):
+        assert direction.delay == SinusoidDelay(0.1, 0.1, 1.0, 0.0)
+        assert direction.loss is direction.reordering is direction.duplication is None
+    assert session.local.device.initial_position_rad == (2 * pi / 3, pi / 2)
+    assert session.remote.device.initial_position_rad == (pi / 6, pi / 6, -pi / 6)
+    for site in (session.local, session.remote):
+        assert set(site.robot.lengths_m) == {0.38}
+        assert set(site.robot.masses_kg) == {0.3}
+        assert site.robot.mass == "point"
+        assert site.limits.torque_nm is site.limits.velocity_rad_s is None
+        assert site.limits.workspace_min_m is None
+    assert session.coupling.omega == session.coupling.b == (1.0, 1.0)
+    assert session.engagement.ramp_s == session.engagement.sub_task_ramp_s == 0.0
+    assert session.local.operator.kind == "none"
+    assert session.remote.null_space.regularisation == 0.0
+    assert session.remote.null_space.rate_limit_rad_s == inf
+    (obstacle,) = session.remote.obstacles
+    assert obstacle.center_m == (0.05, 0.35)
+    assert (obstacle.safe_radius_m, obstacle.collision_radius_m) == (0.2, 0.1)
+    distance = np.linalg.norm(start(session, SiteId.LOCAL).X - start(session, SiteId.REMOTE).X)
+    assert distance == pytest.approx(1.481, abs=5e-4)
+
+
+@pytest.mark.parametrize("path", PAPER, ids=lambda path: path.stem)
+def test_the_gains_of_section_vi(path):
+    session = load_session(path)
+    assert session.local.damping.joint_nm_s == (0.94, 0.94)
+    assert session.remote.damping.joint_nm_s == (3.19, 3.20, 3.21)
+    assert not any(session.local.damping.task_n_s_per_m + session.remote.damping.task_n_s_per_m)
+    paper, theorem_a, theorem_b = certify(session).certificates
+    assert 0.4 < paper.round_trip_s < 0.41
+    assert theorem_a.round_trip_s == pytest.approx(2.87, abs=0.01)
+    assert theorem_b.round_trip_s == 0.0
+
+
+def test_only_the_named_sub_task_acts():
+    tasks = {path.stem: load_session(path).remote.sub_tasks for path in FILES}
+    assert tasks["paper_free"] == tasks["theorem_b"] == ()
+    (singularity,) = tasks["paper_singularity"]
+    assert (singularity.gain, singularity.direction) == (0.01, (1.0, -2.0, 1.0))
+    (obstacle,) = tasks["paper_obstacle"]
+    assert (obstacle.kind, obstacle.gain) == ("paper_obstacle", 1.0)
+
+
+@pytest.mark.parametrize("name", ["theorem_b", "demo", "seven_dof"])
+def test_theorem_b_certifies_the_injected_delays_with_margin(name):
+    certification = certify(load_session(FOLDER / f"{name}.toml"))
+    assert certification.best.theorem == "Theorem B"
+    assert certification.best.round_trip_s > 1.5 * certification.injected_round_trip_s
+
+
+@pytest.mark.parametrize("name", ["demo", "seven_dof"])
+@pytest.mark.parametrize("site", list(SiteId))
+def test_the_loop_rate_carries_the_damping(name, site):
+    assert sampling_ratio(load_session(FOLDER / f"{name}.toml"), site).ratio < 0.4
+
+
+def test_the_demo_starts_aligned_and_clear_of_everything():
+    session = load_session(FOLDER / "demo.toml")
+    local, remote = start(session, SiteId.LOCAL), start(session, SiteId.REMOTE)
+    assert np.linalg.norm(local.X - remote.X) < 0.05
+    (wall,), (post,) = session.remote.environment.walls, session.remote.obstacles
+    assert (remote.X - wall.point_m) @ wall.normal > 0.0
+    assert segment_distance(remote.origins, np.array(post.center_m)) > post.collision_radius_m
+    for site in (session.local, session.remote):
+        box = np.array([site.limits.workspace_min_m, site.limits.workspace_max_m])
+        for terms in (local, remote):
+            assert np.array_equal(np.clip(terms.X, *box), terms.X)
+
+
+def test_the_demo_s_hand_presses_through_the_wall_within_reach():
+    session = load_session(FOLDER / "demo.toml")
+    hand, (wall,) = session.local.operator, session.remote.environment.walls
+    assert isinstance(hand, HumanArmOperator)
+    assert hand.center_m[0] + hand.amplitude_m[0] > wall.point_m[0] > hand.center_m[0]
+    farthest = np.hypot(*(np.array(hand.center_m) + hand.amplitude_m))
+    assert farthest < 0.9 * robot_of(session, SiteId.LOCAL).reach_m[0]
+    assert max(hand.frequency_hz) * 10.0 > 1.0  # a full turn within ten seconds
