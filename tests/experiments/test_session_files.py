@@ -12,7 +12,7 @@ from control_law.sub_tasks.obstacle_distance import segment_distance
 from site_runtime.certification import certify, sampling_ratio
 from site_runtime.keys import SiteId
 from site_runtime.parts import robot_of
-from site_runtime.session import HumanArmOperator, load_session, parse_session
+from site_runtime.session import HumanArmOperator, SessionFileError, load_session, parse_session
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -58,7 +58,11 @@ def test_any_number_changed_changes_the_digest(path):
             continue
         changed = str(float(number[0]) * 0.99 + (1e-3 if float(number[0]) == 0.0 else 0.0))
         mutated = text[: number.start()] + changed + text[number.end() :]
-        assert parse_session(mutated, path).digest != digest, line
+        try:
+            changed_digest = parse_session(mutated, path).digest
+        except SessionFileError:
+            continue  # a mean below its amplitude, say: refused is told apart, too
+        assert changed_digest != digest, line
         seen += 1
     assert seen > 20
 
