@@ -53,10 +53,10 @@ class ClockOffset:
         elapsed_ns = arrival_ns - echo_stamp_ns
         if elapsed_ns < 0 or stamp_ns < echo_arrival_ns:
             return  # an answer before its question: not stamps of one clock
-        # both were measured at some moment of this round trip, so both have drifted since
-        drift_ns = _drift_ns(elapsed_ns)
-        lower_ns = echo_stamp_ns - echo_arrival_ns - drift_ns
-        upper_ns = arrival_ns - stamp_ns + drift_ns
+        # the clocks have drifted since the peer heard me, at most this whole trip ago; since the
+        # peer answered too, but by far less than the time on the way that the upper bound ignores
+        lower_ns = echo_stamp_ns - echo_arrival_ns - _drift_ns(elapsed_ns)
+        upper_ns = arrival_ns - stamp_ns
         if lower_ns > upper_ns:
             return
         if self._updated_ns is not None:

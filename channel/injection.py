@@ -96,7 +96,7 @@ class Injection:
         reordering = self._reordering
         if reordering is not None and self._reordering_rng.random() < reordering.probability:
             release_ns += round(reordering.extra_s * 1e9)
-        if release_ns <= arrival_ns:
+        if release_ns <= arrival_ns and not self._held:  # what is held may be due before it
             self._release(packet)
         else:
             heapq.heappush(self._held, (release_ns, packet.sequence, packet))
@@ -148,6 +148,6 @@ class Injection:
         # the newest at the horizon stays: it is in use if the peer has been silent since
         past = bisect.bisect_right(stamps, horizon_ns) - 1
         excess = max(past, len(stamps) - self._capacity)
-        if excess >= _PRUNE_AT or len(stamps) > self._capacity:
+        if excess >= _PRUNE_AT:
             del stamps[:excess]
             del self._packets[:excess]

@@ -198,6 +198,17 @@ def test_send_keeps_its_rate(period_ms: float, sent: int, jitter_ms: float) -> N
     assert local.counters.sent == pytest.approx(sent, rel=0.005)
 
 
+def test_jitter_does_not_move_a_packet_to_another_tick() -> None:
+    local, _ = pair(send_period_ns=4 * MS)
+    rng = np.random.default_rng(3)
+    sent = [
+        k
+        for k in range(1000)
+        if local.send(k * MS + round(rng.uniform(0.0, 0.4) * MS), 2, ZERO, ZERO, ZERO)
+    ]
+    assert sent == list(range(0, 1000, 4))
+
+
 def test_send_does_not_catch_up_after_a_stall() -> None:
     local, remote = pair(send_period_ns=4 * MS)
     for k in [*range(100), *range(1000, 1100)]:
@@ -311,6 +322,14 @@ def test_a_restarted_peer_is_accepted_after_the_silence() -> None:
     assert abs(offset.offset_ns - 58 * MS) <= offset.uncertainty_ns, "the new run's clock"
     wire.hear(61 * MS, wire.packet(501))
     assert wire.rejected == {Reject.EPOCH: 2}, "the old run does not come back"
+
+
+def test_a_restarted_peer_is_used_once_it_answers() -> None:
+    wire = Wire()
+    assert wire.hear(10 * MS, wire.packet(500, stamp_ns=MS)) is not None
+    unaware = wire.packet(1, epoch=2000, echo_epoch=0, stamp_ns=2 * MS)
+    assert wire.hear(S, unaware) is None
+    assert wire.channel.offset is None
 
 
 def test_no_sample_of_a_former_run_is_used() -> None:

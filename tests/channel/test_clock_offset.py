@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from channel.clock_offset import ClockOffset
@@ -8,6 +8,7 @@ MS = 1_000_000
 S = 1_000_000_000
 
 
+@settings(deadline=None)
 @given(
     offset_ns=st.integers(-(10**15), 10**15),
     drift_ppm=st.integers(-90, 90),

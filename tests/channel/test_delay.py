@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import pydantic
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from channel.delay import (
@@ -70,6 +70,7 @@ def test_sinusoid_is_the_papers() -> None:
     assert quarter.at(math.pi / 2, rng()) == pytest.approx(0.2)
 
 
+@settings(deadline=None)
 @given(
     st.floats(0.0, 1e3),
     st.floats(0.0, 1.0),

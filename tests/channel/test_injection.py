@@ -3,7 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from channel.delay import (
@@ -58,6 +58,7 @@ def newest(stamps: list[int]) -> int | None:
 spacings_ms = st.lists(st.integers(1, 30), min_size=1, max_size=60)
 
 
+@settings(deadline=None)
 @given(
     spacings_ms,
     st.lists(st.integers(0, 60), min_size=60, max_size=60),
@@ -156,7 +157,9 @@ def test_added_comes_on_top_of_the_network() -> None:
     assert now_ns - chosen.stamp_ns == 160 * MS
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(0, 40), min_size=1, max_size=40))
+@example([1, 0])
 def test_added_uses_the_newest_released(delays_ms: list[int]) -> None:
     under_test = injection(Direction(TableDelay(delays_ms)), "added")  # type: ignore[arg-type]
     overtaken = 0

@@ -3,7 +3,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from channel.packet import NO_STAMP, VERSION, Packet, PacketError, Reject, decode, encode
@@ -57,6 +57,7 @@ def with_float(offset: int, value: float) -> bytes:
     return resealed(example()[:offset] + struct.pack("<d", value) + example()[offset + 8 :])
 
 
+@settings(deadline=None)
 @given(fields, vectors)
 def test_what_is_encoded_is_decoded(values: dict[str, int], floats: np.ndarray) -> None:
     packet = decode(encode(vectors=floats, **values))
@@ -89,11 +90,13 @@ def only_a_packet_or_a_packet_error(data: bytes) -> Packet | Reject:
         return error.reason
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=400))
 def test_arbitrary_bytes_are_refused(data: bytes) -> None:
     assert isinstance(only_a_packet_or_a_packet_error(data), Reject)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 147), st.integers(1, 255), st.sampled_from([2, 3]))
 def test_no_changed_byte_goes_unnoticed(place: int, change: int, dimension: int) -> None:
     data = bytearray(example(dimension))
@@ -101,11 +104,13 @@ def test_no_changed_byte_goes_unnoticed(place: int, change: int, dimension: int)
     assert isinstance(only_a_packet_or_a_packet_error(bytes(data)), Reject)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 147))
 def test_no_cut_packet_is_accepted(length: int) -> None:
     assert isinstance(only_a_packet_or_a_packet_error(example()[:length]), Reject)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 147), st.integers(0, 255))
 def test_a_resealed_mutation_is_a_packet_or_refused(place: int, value: int) -> None:
     data = bytearray(example())
