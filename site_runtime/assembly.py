@@ -14,7 +14,7 @@ from site_runtime.clock import Clock
 from site_runtime.controller import Controller
 from site_runtime.guard import Guard
 from site_runtime.keys import SiteId
-from site_runtime.parts import limits_of, robot_of, settings_of
+from site_runtime.parts import limits_of, robot_of
 from site_runtime.session import Session
 from site_runtime.site import Site, SiteTimes
 from site_runtime.supervisor import EngagementTimes, Supervisor
@@ -46,7 +46,7 @@ def assemble(
     contact: ContactForce,
 ) -> Site:
     """Build one site of a session around its controller and what touches its robot."""
-    own = settings_of(session, identity)
+    own = session.site(identity)
     inbound = (
         session.channel.remote_to_local
         if identity is SiteId.LOCAL

@@ -15,7 +15,7 @@ from control_law.certificates import (
 )
 from hardware.robot_model import RobotModel
 from site_runtime.keys import SiteId
-from site_runtime.parts import coupling_of, damping_of, robot_of, settings_of
+from site_runtime.parts import coupling_of, damping_of, robot_of
 from site_runtime.session import Session
 
 POSES = 2000
@@ -62,7 +62,7 @@ def certify(session: Session) -> Certification:
     """Certify a session's gains by each theorem."""
     coupling = coupling_of(session.coupling)
     local, remote = (
-        SiteGains(damping_of(settings_of(session, site).damping), robot_of(session, site).reach_m)
+        SiteGains(damping_of(session.site(site).damping), robot_of(session, site).reach_m)
         for site in (SiteId.LOCAL, SiteId.REMOTE)
     )
     hold_s = session.period_ns * 1e-9
@@ -81,7 +81,7 @@ def certify(session: Session) -> Certification:
 def sampling_ratio(session: Session, site: SiteId) -> SamplingRatio:
     """Search the pose where damping weighs most against inertia, by seeded random poses."""
     robot = robot_of(session, site)
-    damping = damping_of(settings_of(session, site).damping)
+    damping = damping_of(session.site(site).damping)
     rng = np.random.default_rng(session.seed)
     worst, where = 0.0, np.zeros(robot.joints)
     for pose in _poses(robot, rng):

@@ -14,23 +14,16 @@ from site_runtime.session import (
     CouplingSettings,
     DampingSettings,
     LimitSettings,
-    LocalSettings,
     PaperCoupling,
-    RemoteSettings,
     Session,
 )
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def settings_of(session: Session, site: SiteId) -> LocalSettings | RemoteSettings:
-    """Return the table of one site."""
-    return session.local if site is SiteId.LOCAL else session.remote
-
-
 def robot_of(session: Session, site: SiteId) -> RobotModel:
     """Build the robot model of one site."""
-    return build_robot(settings_of(session, site).robot, session.path.parent)
+    return build_robot(session.site(site).robot, session.path.parent)
 
 
 def coupling_of(settings: CouplingSettings) -> Coupling:
