@@ -98,6 +98,18 @@ def test_theorem_a_is_exact_for_a_planar_arm(planar_chain: Callable[..., Any]) -
             assert margin(chain, joint, q, 0.999 * weight) > 0
 
 
+def test_the_stiffest_axis_decides_and_only_the_paper_ignores_the_slope() -> None:
+    even = Coupling.paper(np.full(2, 2.0), np.ones(2))
+    uneven = Coupling.paper(np.array([1.0, 2.0]), np.ones(2))
+    softened = Coupling.paper(np.array([1.0, 2.0]), np.full(2, 0.5))
+    for rule in (paper_condition, theorem_a):
+        assert rule(uneven, LOCAL, REMOTE) == rule(even, LOCAL, REMOTE)
+    assert paper_condition(softened, LOCAL, REMOTE) == paper_condition(uneven, LOCAL, REMOTE)
+    assert theorem_a(softened, LOCAL, REMOTE).round_trip_s == pytest.approx(
+        2 * theorem_a(uneven, LOCAL, REMOTE).round_trip_s
+    )
+
+
 def test_theorem_b_at_its_edge() -> None:
     task = required_task_damping_theorem_b(0.4, STIFF)
     np.testing.assert_allclose(task, [10.0, 16.0])
