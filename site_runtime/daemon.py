@@ -44,6 +44,9 @@ Quiet: TypeAlias = Annotated[
     bool, typer.Option("--quiet", help="No live status line; the summary still comes.")
 ]
 
+# Ctrl-C, a service manager, a terminal or a login that is lost
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 EXIT_FAULT = 1
 EXIT_NOT_STARTED = 2
 
@@ -64,7 +67,7 @@ def run_daemon(
     session_path: Path,
     options: DaemonOptions,
 ) -> int:
-    """Run one site until Ctrl-C, SIGTERM or the duration's end; return the exit code.
+    """Run one site until a signal to stop or the duration's end; return the exit code.
 
     0 after a clean end, 1 after a fault, 2 if it could not start.
     """
@@ -117,7 +120,7 @@ def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNo
 
 
 class _StopSignals:
-    """Ctrl-C, SIGTERM and the duration end the loop between two ticks, never inside one."""
+    """Signals and the duration end the loop between two ticks, never inside one."""
 
     def __init__(self, clock: SteadyClock, duration_s: float | None) -> None:
         self._clock = clock
@@ -130,7 +133,9 @@ class _StopSignals:
         return self._asked or (self._end_ns is not None and self._clock.now_ns() >= self._end_ns)
 
     def __enter__(self) -> "_StopSignals":
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOP_SIGNALS:
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # started under nohup, to outlive its terminal
             self._before[number] = signal.signal(number, self._ask)
         return self
 

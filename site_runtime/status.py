@@ -8,6 +8,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.table import Table
 
+from channel.packet import Reject
 from site_runtime.guard import Cut
 from site_runtime.site import Site
 from site_runtime.supervisor import State
@@ -93,6 +94,8 @@ def summary(site: Site, console: Console) -> None:
         f"{counters.received} received, {counters.lost} lost, {counters.late} late, "
         f"{counters.rejected.total()} rejected",
     )
+    if counters.rejected[Reject.SESSION]:
+        table.add_row("peer", "it has ANOTHER session file: the sites engage on the same one only")
     if counters.rejected:
         reasons = counters.rejected.most_common()
         table.add_row("rejected", ", ".join(f"{count} {r.name.lower()}" for r, count in reasons))
