@@ -102,7 +102,7 @@ class Dashboard:
     ) -> None:
         self._picture = picture
         self._pumps = [
-            Pump(f"dashboard {sink}", Painter(picture, _to_native(sink)).consume, queue_batches)
+            Pump(f"dashboard {sink}", _painter(picture, sink).consume, queue_batches)
             for sink in sinks
         ]
 
@@ -140,10 +140,24 @@ def _check_shape(picture: Picture, batch: Batch) -> None:
         )
 
 
-def _to_native(sink: Sink) -> LogSinkLike:
-    if isinstance(sink, LiveServer):
-        return rr.GrpcServerSink("127.0.0.1", sink.port, server_memory_limit=SERVER_MEMORY)
-    return rr.FileSink(sink.path)
+def _painter(picture: Picture, sink: Sink) -> "Painter":
+    if isinstance(sink, RecordingFile):
+        try:
+            return Painter(picture, rr.FileSink(sink.path))
+        except RuntimeError as error:
+            raise TelemetryError(f"cannot write the recording {sink.path}: {error}") from error
+    # rerun itself would only log that the port is taken, and serve nothing.
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", sink.port))
+        except OSError as error:
+            raise TelemetryError(
+                f"cannot serve the dashboard on port {sink.port}: {error.strerror}; "
+                "is another one running? Choose another port"
+            ) from error
+    server = rr.GrpcServerSink("127.0.0.1", sink.port, server_memory_limit=SERVER_MEMORY)
+    return Painter(picture, server)
 
 
 # Drawing ----------------------------------------------------------------------------------------
@@ -391,10 +405,9 @@ class Painter:
             for line in wall_lines(wall, picture.reach_m, spatial=picture.spatial)
         ]
         if lines:
-            faint = blend(RED, BACKGROUND, 0.25)
-            self._log_static(
-                "scene/world/walls", self._strips(lines, colors=faint, radii=0.4 * width)
-            )
+            faint = blend(RED, BACKGROUND, 0.5 if picture.spatial else 0.25)
+            radius = (0.15 if picture.spatial else 0.4) * width
+            self._log_static("scene/world/walls", self._strips(lines, colors=faint, radii=radius))
         if not picture.spatial:
             # The viewer's y axis points down in two dimensions; the robots' points up.
             up = rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])
@@ -482,7 +495,7 @@ def _blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
         low, high = extent.low, extent.high
         if picture.spatial:
             center = (low + high) / 2
-            eye = center + picture.reach_m * np.array([0.9, -1.5, 0.9])
+            eye = center + picture.reach_m * np.array([-0.5, -1.3, 0.8])
             return rrb.Spatial3DView(
                 contents=contents,
                 name=name,
@@ -538,6 +551,10 @@ def _blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
 # Viewers ----------------------------------------------------------------------------------------
 
 
+class ViewerCrashError(TelemetryError):
+    """A headless viewer was ended by a signal, as drivers in software sometimes do: try again."""
+
+
 @dataclass(frozen=True, slots=True)
 class Viewer:
     """A viewer started as a child process; `address` is its window's name or its web page."""
@@ -579,6 +596,15 @@ def screenshot(
     Uses a viewer without a window, which needs a Vulkan driver; one in software will do.
     TelemetryError if the viewer cannot be started or does not draw.
     """
+    try:
+        _screenshot(path, picture, arrivals, width, height)
+    except ViewerCrashError:
+        _screenshot(path, picture, arrivals, width, height)
+
+
+def _screenshot(
+    path: Path, picture: Picture, arrivals: Sequence[Arrival], width: int, height: int
+) -> None:
     with headless_viewer(width, height) as client:
         draw(client, picture, arrivals)
         _wait_until_still(client, NOTICE_S)
@@ -594,6 +620,12 @@ def headless_viewer(width: int = 1920, height: int = 1080) -> Iterator[ViewerCli
     try:
         _wait_for_port(port, process)
         yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+    except Exception as error:
+        if (process.poll() or 0) < 0:
+            raise ViewerCrashError(
+                f"the viewer was ended by signal {-process.returncode}"
+            ) from error
+        raise
     finally:
         _end(process)
 
@@ -614,8 +646,8 @@ def draw(client: ViewerClient, picture: Picture, arrivals: Sequence[Arrival]) ->
 
 
 def save_recording(path: Path, picture: Picture, arrivals: Sequence[Arrival]) -> None:
-    """Draw these (batch, arrival [ns]) into a file (.rrd), without dropping any."""
-    paint(Painter(picture, rr.FileSink(path)), picture, arrivals)
+    """Draw these (batch, arrival [ns]) into a file (.rrd), dropping none; TelemetryError."""
+    paint(_painter(picture, RecordingFile(path)), picture, arrivals)
 
 
 def paint(painter: Painter, picture: Picture, arrivals: Sequence[Arrival]) -> None:

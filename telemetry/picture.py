@@ -161,7 +161,7 @@ def wall_lines(wall: WallView, size_m: float, *, spatial: bool) -> list[FloatArr
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         second = np.cross(normal, first)
-        steps = np.linspace(-0.8, 0.8, 9) * size_m
+        steps = np.linspace(-0.5, 0.5, 7) * size_m
         return [
             point + np.outer((steps[0], steps[-1]), along) + step * across
             for along, across in ((first, second), (second, first))

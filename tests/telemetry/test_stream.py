@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from telemetry.rows import (
@@ -119,6 +119,7 @@ def test_last_gives_copies_across_the_end_of_the_ring() -> None:
     assert len(stream.last(0)) == 0
 
 
+@settings(deadline=None, max_examples=30)
 @given(
     batch_rows=st.integers(1, 7),
     steps=st.lists(st.tuples(st.integers(0, 700), st.sampled_from(["flush", "drain"])), max_size=6),
@@ -188,24 +189,28 @@ def test_a_malformed_header_is_refused(offset: int, code: str, value: Any, messa
         decode_batch(bytes(payload))
 
 
+@settings(deadline=None)
 @given(cut=st.integers(0, HEADER_BYTES + 5 * row_dtype(3, 2).itemsize - 1))
 def test_a_truncated_batch_is_refused(cut: int) -> None:
     with pytest.raises(TelemetryError):
         decode_batch(good_payload()[:cut])
 
 
+@settings(deadline=None)
 @given(extra=st.binary(min_size=1, max_size=300))
 def test_a_batch_with_bytes_to_spare_is_refused(extra: bytes) -> None:
     with pytest.raises(TelemetryError):
         decode_batch(good_payload() + extra)
 
 
+@settings(deadline=None)
 @given(payload=st.binary(max_size=400))
 def test_noise_is_refused(payload: bytes) -> None:
     with pytest.raises(TelemetryError):
         decode_batch(payload)
 
 
+@settings(deadline=None)
 @given(header=st.binary(min_size=HEADER_BYTES - 5, max_size=HEADER_BYTES - 5))
 def test_noise_behind_a_good_magic_is_refused_or_a_batch(header: bytes) -> None:
     body = good_payload()[HEADER_BYTES:]
