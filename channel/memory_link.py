@@ -40,7 +40,7 @@ class MemoryLink:
         self._inbox.clear()
 
 
-def memory_links(capacity: int = 256) -> tuple[MemoryLink, MemoryLink]:
+def memory_links(capacity: int = 64) -> tuple[MemoryLink, MemoryLink]:
     """Return a connected pair; each ring keeps the newest `capacity` datagrams."""
     if capacity < 1:
         raise ValueError(f"capacity = {capacity} is not allowed: it must be at least 1")

@@ -197,8 +197,8 @@ def test_delays_run_on_session_time() -> None:
 
 def test_off_uses_the_newest_and_ignores_the_direction() -> None:
     direction = Direction(ConstantDelay(1.0), BurstLoss(1.0, 0.0), None, Duplication(1.0))
-    for settings in (direction, None):
-        under_test = injection(settings, "off")
+    for ignored in (direction, None):
+        under_test = injection(ignored, "off")
         assert under_test.copies() == 1
         assert under_test.choose(0, 0) is None
         under_test.put(packet(5, 1), 10)
