@@ -1,4 +1,5 @@
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from math import isnan
 
 import numpy as np
@@ -81,7 +82,7 @@ def test_at_most_one_tick_a_period_and_none_unaccounted_for(ticks: list[tuple[in
         assert pacer.wait() >= 0
         periods.append((clock.now_ns() - START) // PERIOD)
         clock._now_ns += work_ns
-    assert all(later > earlier for earlier, later in zip(periods, periods[1:], strict=False))
+    assert all(later > earlier for earlier, later in pairwise(periods))
     assert len(ticks) + pacer.missed == periods[-1]
 
 

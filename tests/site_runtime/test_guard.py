@@ -102,7 +102,7 @@ def test_the_target_is_the_nearest_point_of_the_workspace(
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 @pytest.mark.parametrize("limits", [Limits(TORQUE, SPEED, LOW, HIGH), UNLIMITED])
 def test_a_torque_that_is_no_number_is_refused(bad: float, limits: Limits) -> None:
-    with pytest.raises(GuardError, match="torque.*not finite"):
+    with pytest.raises(GuardError, match=r"torque.*not finite"):
         Guard(limits).torque(np.array([0.0, bad, 0.0]), np.zeros(3), np.zeros(3))
 
 
@@ -121,7 +121,7 @@ def test_a_reading_that_is_no_number_is_refused(
     values = {"position_rad": np.zeros(3), "velocity_rad_s": np.zeros(3), "wrench": np.zeros(6)}
     guard.reading(DeviceState(**values, stamp_ns=0))
     values[field][-1] = bad
-    with pytest.raises(GuardError, match=f"{name}.*not finite"):
+    with pytest.raises(GuardError, match=rf"{name}.*not finite"):
         guard.reading(DeviceState(**values, stamp_ns=0))
 
 

@@ -1,0 +1,491 @@
+"""One site, its ticks called by hand, against a peer that is a channel alone."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import nan
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from channel.channel import Channel, PeerSample
+from channel.memory_link import MemoryLink, memory_links
+from hardware.interface import DeviceError, DeviceState
+from hardware.robot_model import PlanarArm, RobotModel, RobotTerms, build_robot
+from site_runtime.clock import ManualClock
+from site_runtime.controller import Command
+from site_runtime.guard import Guard, GuardError, Limits
+from site_runtime.keys import SiteId
+from site_runtime.site import Site, SiteTimes
+from site_runtime.supervisor import EngagementTimes, State, Supervisor
+from telemetry.rows import NO_PEER_STATE
+from telemetry.stream import TelemetryStream, decode_batch
+
+FloatArray = npt.NDArray[np.float64]
+MS = 1_000_000
+DIGEST, EPOCH, PEER_EPOCH = 11, 21, 22
+HOLD_AFTER = 20 * MS
+Q = np.array([0.3, 0.8])
+
+
+@dataclass
+class Journal:
+    """What was called, in order; a name in `trouble` raises when it is called."""
+
+    calls: list[str] = field(default_factory=list)
+    trouble: dict[str, BaseException] = field(default_factory=dict)
+
+    def note(self, name: str) -> None:
+        self.calls.append(name)
+        if name in self.trouble:
+            raise self.trouble[name]
+
+    def count(self, name: str) -> int:
+        return self.calls.count(name)
+
+
+@dataclass
+class FakeDevice:
+    journal: Journal
+    clock: ManualClock
+    joints: int = 2
+    wrench: FloatArray = field(default_factory=lambda: np.arange(1.0, 7.0))
+    velocity: FloatArray = field(default_factory=lambda: np.array([0.1, -0.2]))
+    written: list[FloatArray] = field(default_factory=list)
+
+    def open(self) -> None:
+        self.journal.note("open")
+
+    def enable(self) -> None:
+        self.journal.note("enable")
+
+    def read(self) -> DeviceState:
+        self.journal.note("read")
+        return DeviceState(Q.copy(), self.velocity.copy(), self.wrench.copy(), self.clock.now_ns())
+
+    def write(self, torque_nm: FloatArray) -> None:
+        self.journal.note("write")
+        self.written.append(torque_nm.copy())
+
+    def stop(self) -> None:
+        self.journal.calls.append("stop")  # never raises
+
+    def close(self) -> None:
+        self.journal.note("close")
+
+
+class NotedRobot:
+    def __init__(self, model: RobotModel, journal: Journal) -> None:
+        self._model, self._journal = model, journal
+        self.joints, self.task_dimension = model.joints, model.task_dimension
+
+    def terms(self, q: FloatArray, q_dot: FloatArray) -> RobotTerms:
+        self._journal.note("terms")
+        return self._model.terms(q, q_dot)
+
+
+class NotedController:
+    """A spring to the target, so that the torque tells which target it was given."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self.asked: list[tuple[FloatArray, float]] = []
+
+    def step(self, terms: RobotTerms, peer_position_m: FloatArray, engaged_s: float) -> Command:
+        self._journal.note("controller")
+        self.asked.append((peer_position_m.copy(), engaged_s))
+        force = peer_position_m - terms.X
+        return Command(terms.J.T @ force, force, 0.25)
+
+
+class NotedGuard(Guard):
+    def __init__(self, limits: Limits, journal: Journal) -> None:
+        super().__init__(limits)
+        self._journal = journal
+
+    def torque(self, *arguments: FloatArray) -> FloatArray:
+        self._journal.note("guard")
+        return super().torque(*arguments)
+
+
+class NotedChannel(Channel):
+    journal: Journal
+
+    def latest(self, now_ns: int) -> PeerSample | None:
+        self.journal.note("latest")
+        return super().latest(now_ns)
+
+    def send(self, *arguments: object) -> bool:
+        self.journal.note("send")
+        return super().send(*arguments)  # type: ignore[arg-type]
+
+
+class NotedTelemetry(TelemetryStream):
+    journal: Journal
+
+    def put(self, **fields: object) -> None:
+        self.journal.note("put")
+        super().put(**fields)  # type: ignore[arg-type]
+
+
+class Bench:
+    def __init__(self, *, peer_digest: int = DIGEST, send_every: int = 1) -> None:
+        self.clock, self.journal = ManualClock(), Journal()
+        self.published: list[bytes] = []
+        mine, theirs = memory_links()
+        self.peer_link: MemoryLink = theirs
+        self.peer = self._channel(Channel, theirs, 1, peer_digest, PEER_EPOCH, 1)
+        self.peer_state, self.peer_position = State.READY, np.array([0.5, 0.25])
+        channel = self._channel(NotedChannel, mine, 0, DIGEST, EPOCH, send_every)
+        telemetry = NotedTelemetry(2, 2, 0, DIGEST, EPOCH, self.published.append, batch_rows=1)
+        channel.journal = telemetry.journal = self.journal
+        self.device = FakeDevice(self.journal, self.clock)
+        self.controller = NotedController(self.journal)
+        self.model = build_robot(PlanarArm("planar", (0.4, 0.3), (1.0, 1.0)), None)
+        limits = Limits(np.full(2, 5.0), np.full(2, 9.0), np.full(2, -1.0), np.full(2, 1.0))
+        self.site = Site(
+            SiteId.LOCAL,
+            device=self.device,
+            robot=NotedRobot(self.model, self.journal),  # type: ignore[arg-type]
+            channel=channel,
+            controller=self.controller,
+            supervisor=Supervisor(EngagementTimes(0, HOLD_AFTER, 0.01)),
+            guard=NotedGuard(limits, self.journal),
+            telemetry=telemetry,
+            clock=self.clock,
+            times=SiteTimes(MS, send_every * MS, 3 * MS),
+            certified_round_trip_s=0.4,
+            obstacles_m=(np.array([0.0, 0.5]),),
+        )
+        self.site.open()
+
+    def _channel(
+        self, kind: type[Channel], link: MemoryLink, site: int, digest: int, epoch: int, every: int
+    ) -> Channel:
+        return kind(
+            link,
+            site=site,
+            session_digest=digest,
+            epoch=epoch,
+            dimension=2,
+            send_period_ns=every * MS,
+            silence_ns=HOLD_AFTER,
+            session_start_ns=0,
+        )
+
+    def tick(self, count: int = 1, *, peer_speaks: bool = True) -> list[str]:
+        """Let a millisecond pass, the peer speak, the site tick; return what its tick called."""
+        for _ in range(count):
+            self.clock.sleep_until_ns(self.clock.now_ns() + MS)
+            self.peer.latest(self.clock.now_ns())
+            if peer_speaks:
+                rest = np.zeros(2)
+                self.peer.send(self.clock.now_ns(), self.peer_state, self.peer_position, rest, rest)
+            before = len(self.journal.calls)
+            self.site.tick(7)
+        return self.journal.calls[before:]
+
+    def engage(self) -> None:
+        self.tick(5)
+        assert self.site.state is State.ENGAGED
+
+    def row(self) -> np.void:
+        return self.site.telemetry.last(1)[0]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+WAITING = ["read", "latest", "terms", "send", "put"]
+DRIVING = ["read", "latest", "terms", "controller", "guard", "write", "send", "put"]
+
+
+def test_a_tick_that_drives_writes_before_it_sends_and_reports_last(bench: Bench) -> None:
+    bench.engage()
+    assert bench.tick() == DRIVING
+
+
+def test_before_engagement_nothing_is_enabled_and_nothing_written(bench: Bench) -> None:
+    for _ in range(5):
+        assert bench.tick(peer_speaks=False) == WAITING
+    assert bench.site.state is State.READY
+    row = bench.row()
+    assert row["torque_nm"].tolist() == [0.0, 0.0]
+    assert row["peer_state"] == NO_PEER_STATE
+    assert np.isnan(row["peer_position_m"]).all()
+    assert np.isnan(row["round_trip_s"])
+
+
+def test_the_outputs_go_on_once_before_the_first_write(bench: Bench) -> None:
+    bench.engage()
+    calls = bench.journal.calls
+    assert calls.index("enable") < calls.index("controller") < calls.index("write")
+    bench.tick(30, peer_speaks=False)
+    assert bench.site.state is State.HOLD
+    bench.tick(3)
+    assert bench.site.state is State.ENGAGED
+    assert bench.journal.count("enable") == 1
+    assert bench.journal.count("stop") == 0
+
+
+def test_the_controller_is_given_the_peers_point_and_the_time_since_engagement(
+    bench: Bench,
+) -> None:
+    bench.engage()
+    _, first_s = bench.controller.asked[0]
+    bench.peer_position = np.array([0.2, 0.1])
+    bench.tick()
+    target, engaged_s = bench.controller.asked[-1]
+    assert target.tolist() == [0.2, 0.1]
+    assert first_s == 0.0
+    assert engaged_s == pytest.approx((len(bench.controller.asked) - 1) * 1e-3)
+
+
+def test_the_point_and_the_torque_are_guarded(bench: Bench) -> None:
+    bench.engage()
+    bench.peer_position = np.array([40.0, 0.0])
+    bench.tick()
+    assert bench.controller.asked[-1][0].tolist() == [1.0, 0.0]
+    bench.peer_position = np.array([0.5, 0.0])
+    bench.device.velocity = np.array([20.0, 20.0])
+    bench.tick()
+    gravity = bench.model.terms(Q, np.zeros(2)).G
+    spring = bench.controller.step(bench.model.terms(Q, np.zeros(2)), bench.peer_position, 0.0)
+    speeding_up = (spring.torque_nm - gravity) * bench.device.velocity > 0.0
+    assert np.allclose(
+        bench.device.written[-1], np.where(speeding_up, gravity, spring.torque_nm), atol=1e-12
+    )
+
+
+def test_the_row_tells_what_was_done(bench: Bench) -> None:
+    bench.engage()
+    bench.tick()
+    row, terms = bench.row(), bench.model.terms(Q, bench.device.velocity)
+    assert row["stamp_ns"] == bench.clock.now_ns()
+    assert row["time_ns"] == bench.clock.now_ns() - 3 * MS
+    assert row["lateness_ns"] == 7
+    assert row["state"] == State.ENGAGED
+    assert row["peer_state"] == State.READY
+    assert np.array_equal(row["q"], Q)
+    assert np.array_equal(row["q_dot"], bench.device.velocity)
+    assert np.array_equal(row["torque_nm"], bench.device.written[-1])
+    assert np.allclose(row["position_m"], terms.X)
+    assert np.allclose(row["velocity_m_s"], terms.X_dot)
+    assert row["external_force_n"].tolist() == [1.0, 2.0]
+    assert np.allclose(row["coupling_force_n"], bench.peer_position - terms.X)
+    assert np.array_equal(row["peer_position_m"], bench.peer_position)
+    assert row["sub_task_error_rad_s"] == 0.25
+    assert row["manipulability"] == pytest.approx(np.linalg.det(terms.J @ terms.J.T))
+    middles = 0.5 * (terms.origins[1:, :2] + terms.origins[:-1, :2])
+    assert row["midpoint_distance_m"] == pytest.approx(
+        np.linalg.norm(middles - [0.0, 0.5], axis=1).min()
+    )
+    assert row["link_distance_m"] <= row["midpoint_distance_m"]
+    assert row["certified_round_trip_s"] == 0.4
+    assert row["round_trip_s"] == pytest.approx(1e-3)  # sent, used at the peer's next tick, back
+    assert bench.site.error_m == pytest.approx(np.linalg.norm(bench.peer_position - terms.X))
+
+
+def test_the_peer_gets_position_velocity_force_and_state(bench: Bench) -> None:
+    bench.engage()
+    bench.tick()
+    heard = bench.peer.latest(bench.clock.now_ns())
+    terms = bench.model.terms(Q, bench.device.velocity)
+    assert heard is not None
+    assert np.array_equal(heard.position_m, terms.X)
+    assert np.array_equal(heard.velocity_m_s, terms.X_dot)
+    assert heard.force_n.tolist() == [1.0, 2.0]
+    assert heard.state == State.ENGAGED
+
+
+def test_the_round_trip_is_unknown_again_when_the_peer_uses_none_of_mine(bench: Bench) -> None:
+    bench.engage()
+    assert bench.site.round_trip_s > 0.0
+    bench.peer = bench._channel(Channel, bench.peer_link, 1, DIGEST, PEER_EPOCH + 1, 1)
+    bench.peer_link.receive()  # the new run has heard nothing yet
+    for _ in range(25):
+        bench.clock.sleep_until_ns(bench.clock.now_ns() + MS)
+        rest = np.zeros(2)
+        bench.peer.send(bench.clock.now_ns(), State.READY, rest, rest, rest)
+        bench.site.tick()
+    assert bench.site.state is State.HOLD
+    assert np.isnan(bench.site.round_trip_s)
+    assert np.isnan(bench.row()["round_trip_s"])
+
+
+def test_a_peer_of_another_session_never_gets_the_robot_moving() -> None:
+    bench = Bench(peer_digest=DIGEST + 1)
+    bench.tick(100)
+    assert bench.site.state is State.READY
+    assert bench.site.channel.session_mismatch
+    assert bench.device.written == []
+    assert bench.journal.count("enable") == 0
+
+
+def test_silence_holds_the_last_point_under_torque_and_the_end_of_it_resumes(bench: Bench) -> None:
+    bench.engage()
+    ticks_of_silence = HOLD_AFTER // MS
+    bench.tick(ticks_of_silence, peer_speaks=False)
+    assert bench.site.state is State.ENGAGED
+    assert bench.tick(peer_speaks=False) == DRIVING
+    assert bench.site.state is State.HOLD
+    assert np.array_equal(bench.controller.asked[-1][0], bench.peer_position)
+    assert bench.tick() == DRIVING
+    assert bench.site.state is State.ENGAGED
+
+
+@pytest.mark.parametrize("peer_state", [State.FAULT, State.OFFLINE])
+def test_a_peer_that_fails_or_leaves_is_seen_at_once(bench: Bench, peer_state: State) -> None:
+    bench.engage()
+    bench.peer_state = peer_state
+    bench.tick()
+    assert bench.site.state is State.HOLD
+
+
+@pytest.mark.parametrize("place", ["read", "latest", *DRIVING[2:], "enable"])
+def test_whatever_fails_stops_the_device_and_latches_fault(bench: Bench, place: str) -> None:
+    if place != "enable":
+        bench.engage()
+    error = DeviceError(f"{place} failed")
+    bench.journal.trouble[place] = error
+    calls = bench.tick() if place != "enable" else bench.tick(5)
+    if place != "enable":
+        assert calls[calls.index(place) :] == [place, "stop"]
+    assert bench.site.failure is error
+    assert bench.site.state is State.FAULT
+    del bench.journal.trouble[place]
+    calls_after = bench.tick(50)
+    assert calls_after == ["latest", "send"]
+    assert bench.site.state is State.FAULT
+    assert bench.journal.calls.index("stop") > bench.journal.calls.index(place)
+    stopped_at = bench.journal.calls.index("stop")
+    assert not {"read", "write", "enable"} & set(bench.journal.calls[stopped_at:])
+    assert bench.peer.heard_state == State.FAULT
+    bench.site.close()
+    bench.peer.latest(bench.clock.now_ns())
+    assert bench.peer.heard_state == State.FAULT
+
+
+def test_a_fault_is_in_the_rows_with_no_torque(bench: Bench) -> None:
+    bench.engage()
+    bench.journal.trouble["read"] = DeviceError("cable out")
+    last = bench.row().copy()
+    bench.tick(4)
+    row = bench.row()
+    assert row["state"] == State.FAULT
+    assert row["stamp_ns"] == bench.clock.now_ns()
+    assert row["time_ns"] == bench.clock.now_ns() - 3 * MS
+    assert row["torque_nm"].tolist() == row["coupling_force_n"].tolist() == [0.0, 0.0]
+    assert np.array_equal(row["q"], last["q"])
+    assert bench.site.ticks == 9
+
+
+@pytest.mark.parametrize("reading", ["position", "velocity", "wrench"])
+@pytest.mark.parametrize("engaged", [False, True])
+def test_a_reading_that_is_no_number_is_a_fault(bench: Bench, reading: str, engaged: bool) -> None:
+    if engaged:
+        bench.engage()
+    spoiled = {"position": Q.copy(), "velocity": np.zeros(2), "wrench": np.zeros(6)}
+    spoiled[reading][1] = nan
+    written = len(bench.device.written)
+    bench.device.read = lambda: DeviceState(  # type: ignore[method-assign]
+        spoiled["position"], spoiled["velocity"], spoiled["wrench"], 0
+    )
+    bench.tick()
+    assert isinstance(bench.site.failure, GuardError)
+    assert bench.site.state is State.FAULT
+    assert "stop" in bench.journal.calls
+    assert len(bench.device.written) == written
+
+
+def test_a_torque_that_is_no_number_is_a_fault_and_never_written(bench: Bench) -> None:
+    bench.engage()
+    bench.controller.step = lambda *_: Command(  # type: ignore[method-assign]
+        np.array([nan, 0.0]), np.zeros(2)
+    )
+    written = len(bench.device.written)
+    bench.tick()
+    assert isinstance(bench.site.failure, GuardError)
+    assert len(bench.device.written) == written
+
+
+def test_a_link_that_keeps_failing_neither_raises_nor_keeps_the_device(bench: Bench) -> None:
+    bench.engage()
+    bench.journal.trouble["send"] = OSError("no network")
+    bench.tick(5)
+    assert str(bench.site.failure) == "no network"
+    assert bench.row()["state"] == State.FAULT
+    with pytest.raises(OSError, match="no network"):
+        bench.site.close()
+    assert bench.journal.calls[-1] == "close"
+
+
+@pytest.mark.parametrize("send_every", [1, 7])
+def test_a_clean_end_stops_then_tells_the_peer_then_closes(send_every: int) -> None:
+    bench = Bench(send_every=send_every)
+    bench.tick(23)
+    assert bench.site.state is State.ENGAGED
+    before = len(bench.journal.calls)
+    bench.site.close()
+    calls = bench.journal.calls[before:]
+    assert calls[0] == "stop"
+    assert calls[-1] == "close"
+    assert set(calls[1:-1]) == {"send"}
+    bench.peer.latest(bench.clock.now_ns())
+    assert bench.peer.heard_state == State.OFFLINE
+    assert bench.site.state is State.OFFLINE
+
+
+def stop_after(ticks: int) -> Callable[[], bool]:
+    answers = iter([False] * ticks)
+    return lambda: next(answers, True)
+
+
+def test_run_ticks_at_its_period_publishes_and_ends_cleanly() -> None:
+    bench = Bench()
+    bench.site.run(stop_after(10))
+    assert bench.site.ticks == 10
+    assert bench.site.missed == 0
+    rows = np.concatenate([decode_batch(payload).rows for payload in bench.published])
+    assert rows["stamp_ns"].tolist() == [k * MS for k in range(1, 11)]
+    assert bench.site.lateness.percentiles_us(100) == (0.0,)
+    assert bench.journal.calls[-1] == "close"
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt(), SystemExit(1)])
+@pytest.mark.parametrize("place", ["read", "send"])
+def test_run_stops_the_robot_even_when_it_is_torn_down(
+    interruption: BaseException, place: str
+) -> None:
+    bench = Bench()
+
+    def torn_down() -> bool:
+        if bench.site.ticks == 3:
+            bench.journal.trouble[place] = interruption
+        return False
+
+    with pytest.raises(type(interruption)):
+        bench.site.run(torn_down)
+    calls = bench.journal.calls
+    assert "stop" in calls[len(calls) - 1 - calls[::-1].index("read") :]
+    assert calls[-1] == "close"
+
+
+def test_run_counts_the_ticks_it_missed() -> None:
+    bench = Bench()
+    read = bench.device.read
+
+    def slow_read() -> DeviceState:
+        if bench.site.ticks == 2:
+            bench.clock.sleep_until_ns(bench.clock.now_ns() + 10 * MS)
+        return read()
+
+    bench.device.read = slow_read  # type: ignore[method-assign]
+    bench.site.run(stop_after(6))
+    rows = np.concatenate([decode_batch(payload).rows for payload in bench.published])
+    assert bench.site.missed == 9
+    assert rows["missed"].tolist() == [0, 0, 0, 9, 9, 9]
+    assert rows["lateness_ns"].tolist() == [0, 0, 0, 9 * MS, 0, 0]
+    assert rows["duration_ns"].tolist() == [0, 0, 0, 10 * MS, 0, 0]
