@@ -200,6 +200,11 @@ class Channel:
         return self._newest is not None and self._newest.echo_epoch == self._epoch
 
     @property
+    def peer_present(self) -> bool:
+        """Whether the link sees the peer's process. For people: silence is what safety watches."""
+        return self._link.peer_present()
+
+    @property
     def session_mismatch(self) -> bool:
         """Whether a peer with another session file was heard within the last second."""
         if self._mismatch_ns is None or self._now_ns is None:

@@ -63,9 +63,9 @@ def describe(site: Site, rate_hz: float) -> str:
     round_trip_ms = site.round_trip_s * 1e3
     margin_ms = (site.certified_round_trip_s - site.round_trip_s) * 1e3
     parts = [f"{site.identity.label:6} {site.state.name:8} {rate_hz:6.0f} Hz"]
-    if isnan(round_trip_ms):
-        parts.append("no peer yet")
-    else:
+    if not site.channel.peer_present:
+        parts.append("no peer")
+    if not isnan(round_trip_ms):
         parts.append(f"round trip {round_trip_ms:6.1f} ms")
         parts.append(f"margin {margin_ms:6.1f} ms")
     if not isnan(site.error_m):
