@@ -200,6 +200,22 @@ def test_the_ghost_is_the_peer_one_delay_ago(run: Any, recording: Recording, cha
         assert np.array_equal(recorded, expected)
 
 
+def test_a_ghost_waits_for_the_peers_rows(run: Any, chain: Chain, tmp_path: Path) -> None:
+    painter = Painter(picture_of(chain), rr.FileSink(tmp_path / "run.rrd"))
+    for batch, arrival_ns in run.batches(PASSAGES_NS)[:40]:
+        rows = batch.rows.copy()
+        rows["one_way_delay_s"] = 1e-3
+        painter.consume([(dataclasses.replace(batch, rows=rows), arrival_ns)], False)
+    painter.consume([], True)
+    times_ns, components = read(tmp_path / "run.rrd")["/scene/local/ghost"]
+    # At first the peer's clock is still unknown.
+    known = times_ns > 500 * MS
+    expected = chain(run.remote["q"][(times_ns[known] - MS) // MS])[:, :, :2].astype(np.float32)
+    ghosts = components["LineStrips2D:strips"]
+    recorded = np.array([ghosts[i][0] for i in np.flatnonzero(known)])
+    assert np.array_equal(recorded, expected)
+
+
 def test_trails_hold_three_seconds(recording: Recording) -> None:
     for name in ("local", "remote"):
         _, arms = recording[f"/scene/{name}/arm"]
