@@ -7,6 +7,7 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from channel.packet import Reject
 from site_runtime.guard import Cut
@@ -105,7 +106,8 @@ def summary(site: Site, console: Console) -> None:
             "guard cut", ", ".join(f"{_CUT_NAMES[cut]} in {n} ticks" for cut, n in cuts.items())
         )
     if site.state is State.FAULT and site.failure is not None:
-        table.add_row("FAULT", f"[red]{type(site.failure).__name__}: {site.failure}")
+        failure = f"{type(site.failure).__name__}: {site.failure}"
+        table.add_row("FAULT", Text(failure, style="red"))  # no markup: vectors have brackets
     console.print(table)
 
 
