@@ -49,8 +49,6 @@ def certify(session: SessionPath) -> None:
             f"{sampling.LIMIT_LATE_DIFFERENCE:.3f} one tick late)"
         )
     if result.margin_s <= 0.0:
-        OUT.print(
-            "[red]not certified[/red]: raise the damping; or lower stiffness or delay"
-        )
+        OUT.print("[red]not certified[/red]: raise the damping; or lower stiffness or delay")
         raise typer.Exit(EXIT_NOT_CERTIFIED)
     OUT.print(f"[green]certified[/green] by {result.best.theorem}")

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,6 @@ from site_runtime.session import Session, load_session
 from telemetry.dashboard import Dashboard, LiveServer, RecordingFile, Sink, Viewer, start_viewer
 
 POLL_S = 0.02
-STALL_SHOWN_S = 2.0
 
 Save = Annotated[Path | None, typer.Option("--save", help="Also save what is shown, as FILE.rrd.")]
 Port = Annotated[int, typer.Option("--port", help="Loopback port for rerun viewers.")]
@@ -34,16 +33,17 @@ def dashboard(
     """Show a running session live: in a window if there is a display, else as a web page."""
     with user_errors():
         loaded = load_session(session)
-        with closing(Feed(loaded, connect)) as feed, shown(loaded, save, port, web_port) as board:
+        with (
+            suppress(KeyboardInterrupt),
+            closing(Feed(loaded, connect)) as feed,
+            shown(loaded, save, port, web_port) as board,
+            reported(feed, board),
+        ):
             end_s = None if duration is None else time.monotonic() + duration
-            try:
-                while end_s is None or time.monotonic() < end_s:
-                    for batch, arrival_ns in feed.receive():
-                        board.offer(batch, arrival_ns)
-                    time.sleep(POLL_S)
-            except KeyboardInterrupt:
-                pass
-        _report(feed, board)
+            while end_s is None or time.monotonic() < end_s:
+                for batch, arrival_ns in feed.receive():
+                    board.offer(batch, arrival_ns)
+                time.sleep(POLL_S)
 
 
 @contextmanager
@@ -66,11 +66,16 @@ def shown(session: Session, save: Path | None, port: int, web_port: int) -> Iter
             viewer.close()
 
 
-def _report(feed: Feed, board: Dashboard) -> None:
-    for count, what in (
-        (board.dropped_batches, "batches were not shown: the viewer was too slow"),
-        (feed.foreign, "batches were of another session file and not shown"),
-        (feed.broken, "payloads were no telemetry of this version"),
-    ):
-        if count:
-            ERR.print(f"{count} {what}", style="yellow", highlight=False)
+@contextmanager
+def reported(feed: Feed, board: Dashboard) -> Iterator[None]:
+    """Say at the end what was not shown."""
+    try:
+        yield
+    finally:
+        for count, what in (
+            (board.dropped_batches, "batches were not shown: the viewer was too slow"),
+            (feed.foreign, "batches were of another session file and not shown"),
+            (feed.broken, "payloads were no telemetry of this version"),
+        ):
+            if count:
+                ERR.print(f"{count} {what}", style="yellow", highlight=False)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from math import isnan
 from pathlib import Path
 from typing import Annotated
@@ -50,6 +50,7 @@ def demo(
         endpoints = {site: f"tcp/127.0.0.1:{_free_port()}" for site in SiteId}
         recent: deque[tuple[Batch, int]] = deque()
         with (
+            suppress(KeyboardInterrupt),
             shown(loaded, save, port, web_port) as board,
             _sites(session, endpoints) as processes,
             closing(Feed(loaded, tuple(endpoints.values()))) as feed,
@@ -57,18 +58,15 @@ def demo(
         ):
             newest: dict[int, Batch] = {}
             end_s = None if duration is None else time.monotonic() + duration
-            try:
-                while end_s is None or time.monotonic() < end_s:
-                    for batch, arrival_ns in feed.receive():
-                        board.offer(batch, arrival_ns)
-                        newest[batch.site] = batch
-                        recent.append((batch, arrival_ns))
-                    _keep(recent)
-                    live.update(_status(newest), refresh=True)
-                    _check_alive(processes)
-                    time.sleep(POLL_S)
-            except KeyboardInterrupt:
-                pass
+            while end_s is None or time.monotonic() < end_s:
+                for batch, arrival_ns in feed.receive():
+                    board.offer(batch, arrival_ns)
+                    newest[batch.site] = batch
+                    recent.append((batch, arrival_ns))
+                _keep(recent)
+                live.update(_status(newest), refresh=True)
+                _check_alive(processes)
+                time.sleep(POLL_S)
         if screenshot is not None:
             draw_screenshot(screenshot, picture_of(loaded), list(recent))
             ERR.print(f"drawn: {screenshot}")

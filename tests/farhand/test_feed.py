@@ -1,0 +1,79 @@
+"""Telemetry off the network: only this session's rows get through."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from channel.zenoh_link import ZenohNode, ZenohSettings
+from farhand.feed import Feed
+from farhand.picture import picture_of
+from site_runtime.keys import SiteId, telemetry_key
+from site_runtime.session import Session, load_session
+from telemetry.stream import TelemetryStream
+
+EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
+DEADLINE_S = 20.0
+
+
+@pytest.fixture
+def session() -> Session:
+    return load_session(EXPERIMENTS / "demo.toml")
+
+
+@pytest.fixture
+def publish(session: Session) -> Iterator[tuple[str, Callable[[bytes], None]]]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with closing(ZenohNode(ZenohSettings(listen=(endpoint,)))) as node:
+        yield endpoint, node.publisher(telemetry_key(session.name, SiteId.LOCAL))
+
+
+def batch_of(session: Session) -> bytes:
+    published: list[bytes] = []
+    stream = TelemetryStream(2, 2, SiteId.LOCAL, session.digest, 1, published.append)
+    zeros = np.zeros(2)
+    stream.put(
+        stamp_ns=1, time_ns=1, lateness_ns=0, duration_ns=0, state=1, peer_state=255, cut=0,
+        q=zeros, q_dot=zeros, torque_nm=zeros, position_m=zeros, velocity_m_s=zeros,
+        external_force_n=zeros, coupling_force_n=zeros, peer_position_m=zeros,
+        one_way_delay_s=0.0, round_trip_s=0.0, certified_round_trip_s=0.3, manipulability=0.0,
+        link_distance_m=0.0, midpoint_distance_m=0.0, sub_task_error_rad_s=0.0,
+        lost=0, late=0, rejected=0, missed=0,
+    )  # fmt: skip
+    stream.drain()
+    return published[0]
+
+
+def test_own_rows_come_through_and_others_are_counted(
+    session: Session, publish: tuple[str, Callable[[bytes], None]]
+) -> None:
+    endpoint, put = publish
+    own, foreign = batch_of(session), batch_of(replace(session, digest=session.digest ^ 1))
+    with closing(Feed(session, [endpoint])) as feed:
+        received = []
+        deadline = time.monotonic() + DEADLINE_S
+        while not (received and feed.foreign and feed.broken):
+            assert time.monotonic() < deadline, "the feed did not hear the publisher"
+            for payload in (own, foreign, b"garbage"):
+                put(payload)
+            received += feed.receive()
+    assert {batch.digest for batch, _ in received} == {session.digest}
+
+
+@pytest.mark.parametrize("name", ["demo", "seven_dof", "paper_free"])
+def test_the_picture_shows_the_sessions_scene(name: str) -> None:
+    session = load_session(EXPERIMENTS / f"{name}.toml")
+    picture = picture_of(session)
+    assert [view.name for view in picture.sites] == ["local", "remote"]
+    assert len(picture.scene.obstacles) == len(session.remote.obstacles)
+    assert len(picture.scene.walls) == len(session.remote.environment.walls)
+    assert picture.spatial == (session.task.dimension == 3)
+    for view in picture.sites:
+        assert view.chain(np.zeros((3, view.joints))).shape == (3, view.joints + 1, 3)
