@@ -61,6 +61,31 @@ class DaemonOptions:
     quiet: bool
 
 
+def site_command(
+    identity: SiteId, build: Callable[[Session, Surroundings], Site]
+) -> Callable[..., None]:
+    """Return the command that runs one site, for `farhand` and for `python -m`."""
+
+    def command(
+        session: SessionPath,
+        connect: Connect = None,
+        listen: Listen = None,
+        duration: Duration = None,
+        quiet: Quiet = False,
+    ) -> None:
+        options = DaemonOptions(
+            None if connect is None else tuple(connect),
+            None if listen is None else tuple(listen),
+            duration,
+            quiet,
+        )
+        raise typer.Exit(run_daemon(identity, build, session, options))
+
+    command.__name__ = identity.label
+    command.__doc__ = f"Run the {identity.label} site until Ctrl-C."
+    return command
+
+
 def run_daemon(
     identity: SiteId,
     build: Callable[[Session, Surroundings], Site],
