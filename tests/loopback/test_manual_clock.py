@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from channel.channel import Channel
 from channel.delay import (
     BurstLoss,
     ConstantDelay,
@@ -16,6 +17,8 @@ from channel.delay import (
     SinusoidDelay,
     UniformDelay,
 )
+from channel.memory_link import memory_links
+from channel.packet import Reject
 from experiments.simulation import Run, Simulation
 from site_runtime.keys import SiteId
 from site_runtime.session import (
@@ -204,6 +207,33 @@ def test_a_site_started_anew_is_taken_back_without_a_jump(
     assert pair.error_m() < 0.02
 
 
+def test_a_recording_does_not_take_the_place_of_a_peer_that_speaks(
+    make_session: MakeSession, make_pair: MakePair
+) -> None:
+    pair = make_pair(make_session(rate_hz=500))
+    pair.run(1.0)
+    recorder, recorded = memory_links()
+    earlier = Channel(
+        recorder,
+        site=REMOTE,
+        session_digest=pair.session.digest,
+        epoch=7,
+        dimension=2,
+        send_period_ns=pair.session.send_period_ns,
+        silence_ns=1,
+        session_start_ns=0,
+    )
+    elsewhere, rest = np.array([0.2, -0.3]), np.zeros(2)
+    for _ in range(100):
+        earlier.send(pair.clock.now_ns(), State.ENGAGED, elsewhere, rest, rest)
+        for data in recorded.receive():
+            pair.links[REMOTE].send(data)
+        pair.tick()
+        assert pair.local.state is State.ENGAGED
+    assert pair.local.channel.counters.rejected[Reject.EPOCH] == 100
+    assert np.abs(pair.rows(LOCAL, 0.2)["peer_position_m"] - elsewhere).min() > 0.05
+
+
 def test_a_clean_end_of_one_site_is_held_by_the_other(
     make_session: MakeSession, make_pair: MakePair
 ) -> None:
@@ -250,19 +280,18 @@ def test_loss_jitter_and_reordering_leave_it_bounded_and_converging(
         assert site.channel.counters.overtaken > 10
 
 
+@pytest.mark.parametrize("random", ["network", "encoder"])
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(
-    apart: Session, make_channel: MakeChannel, tmp_path: Path
+    apart: Session, make_channel: MakeChannel, tmp_path: Path, random: str
 ) -> None:
-    noisy = replace(apart.local.device, velocity_noise_rad_s=0.01)
-    session = replace(
-        apart,
-        channel=make_channel(UniformDelay(0.0, 0.05), **ROUGH),
-        local=replace(apart.local, device=noisy),
-    )
+    session = replace(apart, channel=make_channel(UniformDelay(0.0, 0.05), **ROUGH))
+    if random == "encoder":
+        noisy = replace(apart.local.device, velocity_noise_rad_s=0.01)
+        session = replace(apart, local=replace(apart.local, device=noisy))
     files = [tmp_path / name for name in ("one.parquet", "two.parquet", "other.parquet")]
     runs = []
     for file, seed in zip(files, (1, 1, 2), strict=True):
-        run = Simulation(replace(session, seed=seed)).run(0.6)
+        run = Simulation(replace(session, seed=seed)).run(0.4)
         write_result(file, run.local, run.remote, {"session": session.text})
         runs.append(run)
     one, two, other = runs
