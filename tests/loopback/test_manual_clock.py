@@ -346,7 +346,7 @@ def test_a_simulation_ends_where_a_site_fails(apart: Session) -> None:
 
 
 def test_a_site_that_fails_at_time_zero_leaves_no_row_but_its_reason(apart: Session) -> None:
-    straight = replace(apart.remote.device, initial_position_rad=(0.3, 0.0, 0.0))
+    straight = replace(apart.remote.device, initial_position_rad=(0.0, 0.0, 0.0))
     exact = replace(apart.remote.null_space, regularisation=0.0)  # (4) as printed: no value here
     session = replace(apart, remote=replace(apart.remote, device=straight, null_space=exact))
     run = Simulation(session).run(1.0)
