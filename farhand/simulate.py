@@ -37,7 +37,8 @@ def simulate(
         run = _simulate(loaded, duration)
         if out is not None:
             write_result(out, run.local, run.remote, _provenance(loaded))
-    _print(run, out)
+    if len(run.local):
+        _print(run, out)
     if run.failures:
         for failure in run.failures:
             ERR.print(f"FAULT {failure}", style="red", markup=False)

@@ -64,6 +64,22 @@ def test_simulate_ends_with_one_when_a_site_fails(tmp_path: Path) -> None:
     assert "diverged" in result.output
 
 
+def test_simulate_tells_of_a_failure_at_time_zero(tmp_path: Path) -> None:
+    session = tmp_path / "session.toml"
+    text = (EXPERIMENTS / "paper_singularity.toml").read_text(encoding="utf-8")
+    # A singular pose, where the paper's own projector has no value.
+    text, count = re.subn(
+        r"initial_position_rad = \[[^\]]*,[^\]]*,[^\]]*\]",
+        "initial_position_rad = [0.0, 0.0, 0.0]",
+        text,
+    )
+    assert count == 1
+    session.write_text(text)
+    result = farhand("simulate", session, "--duration", "1")
+    assert result.exit_code == 1
+    assert "FAULT remote: ZeroDivisionError" in result.output
+
+
 @pytest.mark.parametrize(
     ("session", "theorem"),
     [("paper_free", "Theorem A"), ("theorem_b", "Theorem B"), ("demo", "Theorem B")],
