@@ -4,6 +4,7 @@
 |---|---|---|
 | READY | ENGAGED | peer heard, same session, two-way exchange proven, start time reached |
 | ENGAGED | HOLD | peer silent for `hold_after`, offline, in fault, or started anew |
+| ENGAGED | HOLD | this site itself stalled for `hold_after` |
 | HOLD | ENGAGED | peer back, two-way exchange proven again |
 | any | FAULT | any exception; latched: only a new start leaves it |
 | any | OFFLINE | clean stop |
@@ -77,6 +78,7 @@ class Supervisor:
     def __init__(self, times: EngagementTimes) -> None:
         self._times = times
         self._engaged_ns = 0
+        self._updated_ns: int | None = None
         self._resumed_ns: int | None = None
         self._held: FloatArray | None = None
         self._peer_restarts = 0
@@ -86,6 +88,11 @@ class Supervisor:
     def update(self, now_ns: int, presence: PeerPresence, peer: PeerSample | None) -> State:
         """Take one tick's look at the peer; return the state that this tick runs in."""
         peer_fit = self._peer_fit(now_ns, presence)
+        # after a stall of this site itself the peer's point is elsewhere: hold, then blend
+        stalled = (
+            self._updated_ns is not None and now_ns - self._updated_ns > self._times.hold_after_ns
+        )
+        self._updated_ns = now_ns
         same_peer = presence.counters.peer_restarts == self._peer_restarts
         self._peer_restarts = presence.counters.peer_restarts
         if self.state is State.READY:
@@ -93,7 +100,7 @@ class Supervisor:
                 self.state = State.ENGAGED
                 self._engaged_ns = now_ns
         elif self.state is State.ENGAGED:
-            if not (peer_fit and same_peer):
+            if stalled or not (peer_fit and same_peer):
                 self.state = State.HOLD
                 self._held = self.target_m
         elif self.state is State.HOLD and peer_fit and peer is not None:

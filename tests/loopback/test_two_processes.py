@@ -416,6 +416,8 @@ def test_a_suspended_site_is_held_for_and_returns_to_fresh_samples(rig: Rig) -> 
         return bool(engaged and row["one_way_delay_s"] < silence_s / 2)
 
     rig.until(lambda: fresh(LOCAL) and fresh(REMOTE), "both ENGAGED on fresh samples")
+    # the hand moved on meanwhile: what piled up is neither played back nor jumped to
+    assert largest_resuming_jump_n(rig.rows(REMOTE)) < 2.0
     assert [daemon.stop() for daemon in daemons.values()] == [0, 0]
 
 

@@ -100,6 +100,18 @@ def test_engaged_holds_exactly_when_the_silence_is_longer_than_allowed() -> None
     assert target_x(supervisor) == 2.0
 
 
+def test_engaged_holds_and_blends_after_a_stall_of_its_own() -> None:
+    supervisor = engaged(x=1.0)
+    late_ns = START + HOLD_AFTER
+    assert supervisor.update(late_ns, Presence(late_ns), sample(2.0)) is State.ENGAGED
+    late_ns += HOLD_AFTER + 1
+    assert supervisor.update(late_ns, Presence(late_ns), sample(9.0)) is State.HOLD
+    assert target_x(supervisor) == 2.0
+    late_ns += MS
+    assert supervisor.update(late_ns, Presence(late_ns), sample(9.0)) is State.ENGAGED
+    assert target_x(supervisor) == pytest.approx(2.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     "presence",
     [
