@@ -51,8 +51,9 @@ class ManualClock:
 class Pacer:
     """Absolute deadlines start + k·T. A tick that cannot be met is skipped and counted.
 
-    Never catches up in a burst: after a stall one tick runs at once and the next waits for the
-    first deadline still ahead.
+    Never catches up in a burst. A deadline that is over by more than half a period when the tick
+    before it ends is skipped too: a loop that cannot keep its rate then still leaves the processor
+    to the network, and is not throttled as a runaway by the scheduler.
     """
 
     def __init__(self, clock: Clock, period_ns: int) -> None:
@@ -62,15 +63,20 @@ class Pacer:
         self.missed = 0
 
     def wait(self) -> int:
-        """Sleep to the next deadline; return how late the wake-up is [ns], a stall included."""
+        """Sleep to the next deadline; return how late the wake-up is [ns], skips included."""
         self._deadline_ns += self._period_ns
+        due_ns = self._deadline_ns
+        overdue_ns = self._clock.now_ns() - due_ns
+        if overdue_ns > self._period_ns // 2:
+            self._skip(overdue_ns // self._period_ns + 1)
         self._clock.sleep_until_ns(self._deadline_ns)
-        lateness_ns = self._clock.now_ns() - self._deadline_ns
-        skipped = lateness_ns // self._period_ns
-        if skipped > 0:
-            self.missed += skipped
-            self._deadline_ns += skipped * self._period_ns
-        return lateness_ns
+        now_ns = self._clock.now_ns()
+        self._skip((now_ns - self._deadline_ns) // self._period_ns)
+        return now_ns - due_ns
+
+    def _skip(self, ticks: int) -> None:
+        self.missed += ticks
+        self._deadline_ns += ticks * self._period_ns
 
 
 class LatenessHistogram:

@@ -46,17 +46,26 @@ def test_a_stall_is_skipped_and_counted_never_caught_up() -> None:
     assert pacer.missed == 3
 
 
-def test_a_deadline_in_the_past_gives_one_tick_at_once_and_then_the_grid_again() -> None:
+@pytest.mark.parametrize(
+    ("work_ns", "next_wake", "missed"),
+    [
+        (PERIOD // 2, 2.0, 0),  # done in time
+        (PERIOD + PERIOD // 2, 2.5, 0),  # half a period over: at once
+        (PERIOD + PERIOD // 2 + 1, 3.0, 1),  # more than that: the next deadline
+        (11 * PERIOD + 1, 13.0, 11),
+    ],
+)
+def test_a_tick_that_overruns_is_followed_at_once_or_by_the_next_deadline(
+    work_ns: int, next_wake: float, missed: int
+) -> None:
     clock = LateClock()
     pacer = Pacer(clock, PERIOD)
     pacer.wait()
-    clock.sleep_until_ns(START + 12 * PERIOD + 1)  # the tick's own work took eleven periods
-    assert wakes(clock, pacer, 3) == [
-        (12 + 1 / PERIOD, 10 * PERIOD + 1),
-        (13, 0),
-        (14, 0),
-    ]
-    assert pacer.missed == 10
+    clock.sleep_until_ns(START + PERIOD + work_ns)
+    late_ns = round((next_wake - 2.0) * PERIOD)
+    assert wakes(clock, pacer, 1) == [(next_wake, late_ns)]
+    assert pacer.missed == missed
+    assert wakes(clock, pacer, 1) == [(int(next_wake) + 1.0, 0)]
 
 
 @pytest.mark.parametrize(("late_ns", "missed"), [(PERIOD - 1, 0), (PERIOD, 1), (2 * PERIOD, 2)])
