@@ -1,7 +1,7 @@
 """Hands for a simulated local robot: none, scripted forces, a human arm."""
 
-from dataclasses import dataclass, field
-from math import pi, sin
+from dataclasses import dataclass
+from math import cos, hypot, pi, sin
 
 import numpy as np
 import numpy.typing as npt
@@ -74,16 +74,6 @@ class HumanArm:
     """
 
     settings: HumanArmOperator
-    _center_m: FloatArray = field(init=False)
-    _amplitude_m: FloatArray = field(init=False)
-    _rate_rad_s: FloatArray = field(init=False)
-    _phase_rad: FloatArray = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_center_m", np.array(self.settings.center_m))
-        object.__setattr__(self, "_amplitude_m", np.array(self.settings.amplitude_m))
-        object.__setattr__(self, "_rate_rad_s", 2.0 * pi * np.array(self.settings.frequency_hz))
-        object.__setattr__(self, "_phase_rad", np.array(self.settings.phase_rad))
 
     def force_n(
         self, time_s: float, position_m: FloatArray, velocity_m_s: FloatArray
@@ -91,14 +81,22 @@ class HumanArm:
         """Return the force (z,) [N], no longer than the hand's limit."""
         settings = self.settings
         grip, _ = smooth_ramp(time_s - settings.start_s, settings.grip_s)
-        if grip == 0.0:
-            return np.zeros_like(position_m)
-        angle = self._rate_rad_s * time_s + self._phase_rad
-        wanted_m = self._center_m + self._amplitude_m * np.sin(angle)
-        wanted_m_s = self._amplitude_m * self._rate_rad_s * np.cos(angle)
-        force = grip * (
-            settings.stiffness_n_per_m * (wanted_m - position_m)
-            + settings.damping_n_s_per_m * (wanted_m_s - velocity_m_s)
-        )
-        size = float(np.sqrt(force @ force))
-        return force if size <= settings.force_limit_n else force * (settings.force_limit_n / size)
+        stiffness, damping = settings.stiffness_n_per_m, settings.damping_n_s_per_m
+        force = []
+        for x, x_dot, center, amplitude, frequency_hz, phase in zip(
+            position_m.tolist(),
+            velocity_m_s.tolist(),
+            settings.center_m,
+            settings.amplitude_m,
+            settings.frequency_hz,
+            settings.phase_rad,
+            strict=True,
+        ):
+            rate = 2.0 * pi * frequency_hz
+            angle = rate * time_s + phase
+            behind = center + amplitude * sin(angle) - x
+            slower = amplitude * rate * cos(angle) - x_dot
+            force.append(grip * (stiffness * behind + damping * slower))
+        size = hypot(*force)
+        limit = settings.force_limit_n
+        return np.array(force) * (1.0 if size <= limit else limit / size)

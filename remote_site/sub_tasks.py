@@ -33,7 +33,7 @@ def build_sub_task(settings: RemoteSettings, robot: RobotModel) -> SubTask | Non
         weights += [task.weight] * len(built)
     if not tasks:
         return None
-    total = WeightedSum(tasks, weights)
+    total = tasks[0] if weights == [1.0] else WeightedSum(tasks, weights)
     limit = settings.null_space.rate_limit_rad_s
     return total if isinf(limit) else NormLimiter(total, limit)
 

@@ -128,9 +128,7 @@ def test_a_rate_limit_bounds_the_norm_and_keeps_the_direction(
 
 def test_joint_limits_are_the_urdfs_unless_the_file_gives_them(base: RemoteSettings) -> None:
     arm = build_robot(UrdfArm("urdf", "seven_dof_arm.urdf", "tool_tip"), EXPERIMENTS)
-    built = build_sub_task(settings(base, JointLimitsTask("joint_limits", 0.2)), arm)
-    assert isinstance(built, WeightedSum)
-    (centring,) = built.tasks
+    centring = build_sub_task(settings(base, JointLimitsTask("joint_limits", 0.2)), arm)
     assert isinstance(centring, JointCentring)
     lower, upper = arm.position_limits_rad
     assert np.array_equal(centring.lower_rad, lower)
