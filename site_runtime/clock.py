@@ -66,9 +66,9 @@ class Pacer:
         """Sleep to the next deadline; return how late the wake-up is [ns], skips included."""
         self._deadline_ns += self._period_ns
         due_ns = self._deadline_ns
-        overdue_ns = self._clock.now_ns() - due_ns
-        if overdue_ns > self._period_ns // 2:
-            self._skip(overdue_ns // self._period_ns + 1)
+        overdue_ns = self._clock.now_ns() - due_ns - self._period_ns // 2
+        if overdue_ns > 0:
+            self._skip(-(-overdue_ns // self._period_ns))
         self._clock.sleep_until_ns(self._deadline_ns)
         now_ns = self._clock.now_ns()
         self._skip((now_ns - self._deadline_ns) // self._period_ns)

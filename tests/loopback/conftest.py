@@ -18,8 +18,8 @@ from site_runtime.session import (
     ChannelSettings,
     EngagementSettings,
     LoopSettings,
+    ManipulabilityTask,
     NoOperator,
-    ObstacleTask,
     Session,
     load_session,
 )
@@ -40,7 +40,7 @@ def both_ways(delay: DelayModel, **effects: object) -> ChannelSettings:
 def demo_session(
     channel: ChannelSettings | None = None, *, rate_hz: int = 1000, **changes: object
 ) -> Session:
-    """The demo's arms and gains in free motion: no hand, no wall, no post; quick ramps."""
+    """The demo's arms and gains in free motion: no hand, no wall, no post, bent by itself."""
     demo = load_session(EXPERIMENTS / "demo.toml")
     free = replace(
         demo,
@@ -51,9 +51,7 @@ def demo_session(
         remote=replace(
             demo.remote,
             environment=replace(demo.remote.environment, walls=()),
-            sub_tasks=tuple(
-                task for task in demo.remote.sub_tasks if not isinstance(task, ObstacleTask)
-            ),
+            sub_tasks=(ManipulabilityTask("manipulability", 2.0),),
         ),
     )
     return replace(free, **changes)  # type: ignore[arg-type]

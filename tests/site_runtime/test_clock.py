@@ -52,7 +52,8 @@ def test_a_stall_is_skipped_and_counted_never_caught_up() -> None:
         (PERIOD // 2, 2.0, 0),  # done in time
         (PERIOD + PERIOD // 2, 2.5, 0),  # half a period over: at once
         (PERIOD + PERIOD // 2 + 1, 3.0, 1),  # more than that: the next deadline
-        (11 * PERIOD + 1, 13.0, 11),
+        (11 * PERIOD, 12.0, 10),
+        (11 * PERIOD + PERIOD // 4, 12.25, 10),
     ],
 )
 def test_a_tick_that_overruns_is_followed_at_once_or_by_the_next_deadline(
