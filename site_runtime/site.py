@@ -18,10 +18,10 @@ from site_runtime.controller import Command, Controller
 from site_runtime.guard import Guard
 from site_runtime.keys import SiteId
 from site_runtime.supervisor import DRIVEN, State, Supervisor
+from telemetry.rows import NO_PEER_STATE
 from telemetry.stream import TelemetryStream
 
 FloatArray = npt.NDArray[np.float64]
-_NO_PEER_STATE = 255
 _FAREWELL_PACKETS = 5
 
 
@@ -189,7 +189,7 @@ class Site:
             lateness_ns=lateness_ns,
             duration_ns=self._duration_ns,
             state=self._supervisor.state,
-            peer_state=_NO_PEER_STATE if peer is None else peer.state,
+            peer_state=NO_PEER_STATE if peer is None else peer.state,
             cut=self.guard.cut,
             q=terms.q,
             q_dot=terms.q_dot,
