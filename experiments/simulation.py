@@ -16,6 +16,7 @@ from telemetry.rows import RowArray
 from telemetry.stream import decode_batch
 
 _SETTLE_NS = 100_000_000
+_LOOK_TICKS = 100
 _LOCAL_EPOCH, _REMOTE_EPOCH = 1, 2
 
 
@@ -36,7 +37,7 @@ class Simulation:
     """
 
     def __init__(self, session: Session) -> None:
-        self._period_ns = session.period_ns
+        self.period_ns = session.period_ns
         self._start_ns = _warm_up_ns(session)
         self.clock = ManualClock()
         self._batches: tuple[list[bytes], list[bytes]] = ([], [])
@@ -64,26 +65,45 @@ class Simulation:
             ),
         )
 
-    def run(self, duration_s: float, progress: Callable[[float], None] | None = None) -> Run:
-        """Run to session time `duration_s`, or until a site fails; `progress` gets it [s]."""
+    def run(
+        self,
+        duration_s: float,
+        progress: Callable[[float], None] | None = None,
+        until: Callable[[Run], bool] | None = None,
+    ) -> Run:
+        """Run to session time `duration_s`, until a site fails, or until `until` says so.
+
+        Every 100 ticks `progress` gets the session time [s], and `until` the newest second's rows.
+        """
         sites = (self.local, self.remote)
         for site in sites:
             site.open()
-        ticks = round(self._start_ns / self._period_ns + duration_s * 1e9 / self._period_ns)
+        ticks = round(self._start_ns / self.period_ns + duration_s * 1e9 / self.period_ns)
         for tick in range(ticks + 1):
-            self.clock.sleep_until_ns(tick * self._period_ns)
+            self.clock.sleep_until_ns(tick * self.period_ns)
             for site in sites:
                 site.tick()
                 site.telemetry.flush()
             if any(site.failure for site in sites):
                 break
-            if progress is not None and tick % 100 == 0:
+            if tick % _LOOK_TICKS:
+                continue
+            if progress is not None:
                 progress(max(0.0, (self.clock.now_ns() - self._start_ns) * 1e-9))
+            if until is not None and until(self._newest_second()):
+                break
         for site in sites:
             site.close()
         local, remote = (_rows(batches) for batches in self._batches)
         shared = min(len(local), len(remote))  # a site that fails writes no row of that tick
         return Run(local[:shared], remote[:shared], tuple(map(_failure, filter(_failed, sites))))
+
+    def _newest_second(self) -> Run:
+        """Rows of both sites, of the last second since session time zero."""
+        since_ns = max(0, self.clock.now_ns() - self._start_ns)
+        count = min(since_ns, 1_000_000_000) // self.period_ns
+        local, remote = (site.telemetry.last(count) for site in (self.local, self.remote))
+        return Run(local, remote, ())
 
 
 def _warm_up_ns(session: Session) -> int:

@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from channel.link import LinkError
+from experiments.runner import RunnerError
 from hardware.interface import HardwareError
 from site_runtime.session import SessionError
 from telemetry.rows import TelemetryError
@@ -22,6 +23,6 @@ def user_errors() -> Iterator[None]:
     """Turn what a user can mend into a message and exit code 2; anything else stays a traceback."""
     try:
         yield
-    except (SessionError, HardwareError, LinkError, TelemetryError, OSError) as error:
+    except (SessionError, HardwareError, LinkError, TelemetryError, RunnerError, OSError) as error:
         ERR.print(str(error), style="red", highlight=False, markup=False)
         raise typer.Exit(EXIT_USER_ERROR) from None

@@ -33,17 +33,15 @@ class RemoteController:
         """Return the torque toward the local robot's delayed position (z,) [m]."""
         share, _ = smooth_ramp(engaged_s, self.ramp_s)
         force = share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_r)
-        if self.sub_task is None:
-            zeta = zeta_dot = np.zeros_like(terms.q)
-        else:
-            zeta, zeta_dot = self._reference(self.sub_task, terms, engaged_s)
+        zeta, zeta_dot = self.reference(terms, engaged_s)
         torque, s = control_torque(terms, force, self.damping, zeta, zeta_dot)  # (6)
         error = project(terms.J, s, self.regularisation) if self.sub_task is not None else None
         return Command(torque, -force, 0.0 if error is None else float(np.sqrt(error @ error)))
 
-    def _reference(
-        self, sub_task: SubTask, terms: RobotTerms, engaged_s: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """ζ and ζ̇ of (4), the sub-task's gradient ramped in."""
-        g, g_dot = ramped(*sub_task.evaluate(terms), smooth_ramp(engaged_s, self.sub_task_ramp_s))
+    def reference(self, terms: RobotTerms, engaged_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return ζ and ζ̇ of (4), (n,): the sub-task's gradient, ramped in, in the null space."""
+        if self.sub_task is None:
+            return np.zeros_like(terms.q), np.zeros_like(terms.q)
+        ramp = smooth_ramp(engaged_s, self.sub_task_ramp_s)
+        g, g_dot = ramped(*self.sub_task.evaluate(terms), ramp)
         return null_space_velocity(terms.J, terms.J_dot, g, g_dot, self.regularisation)

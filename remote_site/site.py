@@ -10,19 +10,24 @@ from site_runtime.session import Session
 from site_runtime.site import Site
 
 
+def build_remote_controller(session: Session) -> RemoteController:
+    """Build the remote robot's law."""
+    return RemoteController(
+        coupling=coupling_of(session.coupling),
+        damping=damping_of(session.remote.damping),
+        ramp_s=session.engagement.ramp_s,
+        sub_task=build_sub_task(session.remote, robot_of(session, SiteId.REMOTE)),
+        sub_task_ramp_s=session.engagement.sub_task_ramp_s,
+        regularisation=session.remote.null_space.regularisation,
+    )
+
+
 def build_remote_site(session: Session, surroundings: Surroundings) -> Site:
     """Build the far side."""
     return assemble(
         session,
         SiteId.REMOTE,
         surroundings,
-        RemoteController(
-            coupling=coupling_of(session.coupling),
-            damping=damping_of(session.remote.damping),
-            ramp_s=session.engagement.ramp_s,
-            sub_task=build_sub_task(session.remote, robot_of(session, SiteId.REMOTE)),
-            sub_task_ramp_s=session.engagement.sub_task_ramp_s,
-            regularisation=session.remote.null_space.regularisation,
-        ),
+        build_remote_controller(session),
         build_environment(session.remote.environment, session.task.dimension),
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -48,7 +48,7 @@ def column_names(field: str, length: int) -> tuple[str, ...]:
 
 
 def write_result(
-    path: str | PathLike[str],
+    path: str | PathLike[str] | BinaryIO,
     local_rows: RowArray,
     remote_rows: RowArray,
     metadata: Mapping[str, str],
@@ -84,8 +84,8 @@ def write_result(
         raise TelemetryError(f"cannot write the result {path}: {error}") from error
 
 
-def read_result(path: str | PathLike[str]) -> Result:
-    """Read a file of `write_result`; TelemetryError if it is not one."""
+def read_result(path: str | PathLike[str] | BinaryIO) -> Result:
+    """Read what `write_result` wrote; TelemetryError if it is not that."""
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:

@@ -1,98 +1,50 @@
-"""The paper's §VI, reproduced by `farhand simulate`: three sub-tasks, and Theorem B's damping.
+"""The paper's §VI in free motion: three sub-tasks, and the dampings of Theorems A and B.
 
 The figures are invariants: the paper gives no absolute reference, so its final pose is one of a
-continuum. Three sessions of minutes are simulated once, two at a time; these are slow tests.
+continuum. Sessions of minutes are simulated once, on all cores; these are slow tests.
 """
 
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from experiments.measures import settling_time_s
-from telemetry.result_file import read_result
+from experiments.case import Case, Outcome
+from experiments.runner import run_cases
 
 pytestmark = pytest.mark.timeout(1500)
 
-ROOT = Path(__file__).parents[2]
 ONE_PERCENT = 0.01
 SECOND_S, MILLIMETRE_M = 1.0, 1e-3
-# A little beyond the time at which the error is below 1 mm, the longest first.
-DURATION_S = {
-    "paper_free": 202,
-    "paper_obstacle": 156,
-    "paper_singularity": 139,
-    "theorem_b": 7,
-}
-
-
-@dataclass(frozen=True)
-class Figures:
-    """What is read off one run; undelayed error e_l⁰ = X_l − X_r [m], index w = det(J_r J_rᵀ)."""
-
-    time_s: npt.NDArray[np.float64]
-    error_m: npt.NDArray[np.float64]
-    index: npt.NDArray[np.float64]
-    end_m: npt.NDArray[np.float64]
-    midpoint_m: npt.NDArray[np.float64]
-    torque_nm: npt.NDArray[np.float64]
-    sub_task_error_rad_s: npt.NDArray[np.float64]
-
-    def settled_s(self, limit_m: float) -> float:
-        settled_s = settling_time_s(self.time_s, self.error_m, limit_m)
-        assert settled_s is not None
-        return settled_s
-
-    def error_at_m(self, time_s: float) -> float:
-        return float(np.interp(time_s, self.time_s, self.error_m))
-
-
-def simulate(name: str, folder: Path) -> Figures:
-    """Run the command as a person would, and read its result file."""
-    result = folder / f"{name}.parquet"
-    session = ROOT / "experiments" / f"{name}.toml"
-    arguments = [str(session), "--duration", str(DURATION_S[name]), "--out", str(result)]
-    command = [sys.executable, "-m", "farhand", "simulate", *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    columns = (run := read_result(result)).columns
-    local, remote = (
-        np.column_stack([columns[f"{site}_position_{axis}"] for axis in "xy"])
-        for site in ("local", "remote")
-    )
-    return Figures(
-        time_s=run.time_s,
-        error_m=np.linalg.norm(local - remote, axis=1),
-        index=columns["remote_manipulability"],
-        end_m=remote[-1],
-        midpoint_m=columns["remote_midpoint_distance_m"],
-        torque_nm=np.column_stack([columns[f"remote_torque_{joint}"] for joint in (1, 2, 3)]),
-        sub_task_error_rad_s=columns["remote_sub_task_error_rad_s"],
-    )
+NO_HAND = {"local.operator": {"kind": "none"}}
+# A little beyond the time at which the error is below 1 mm.
+CASES = (
+    Case("paper_free", "paper_free.toml", 202),
+    Case("paper_obstacle", "figure_3.toml", 156, NO_HAND),
+    Case("paper_singularity", "figure_2.toml", 139, NO_HAND),
+    Case("theorem_a", "theorem_a.toml", 32),
+    Case("theorem_b", "theorem_b.toml", 7),
+)
 
 
 @pytest.fixture(scope="session")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figures]:
-    folder = tmp_path_factory.mktemp("paper")
-    with ThreadPoolExecutor(2) as pool:
-        runs = pool.map(lambda name: simulate(name, folder), DURATION_S)
-        return dict(zip(DURATION_S, runs, strict=True))
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
+    return run_cases(CASES, tmp_path_factory.mktemp("paper"))
 
 
-PAPER = [name for name in DURATION_S if name.startswith("paper")]
+def error_at_m(outcome: Outcome, time_s: float) -> float:
+    return float(np.interp(time_s, outcome.time_s, np.linalg.norm(outcome.error_m(), axis=1)))
 
 
-@pytest.mark.parametrize("name", DURATION_S)
-def test_all_start_where_the_paper_does(figures: dict[str, Figures], name: str) -> None:
-    run = figures[name]
+NAMES = [case.name for case in CASES]
+PAPER = [name for name in NAMES if name.startswith("paper")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_all_start_where_the_paper_does(outcomes: dict[str, Outcome], name: str) -> None:
+    run = outcomes[name]
+    assert run.failures == ()
     assert run.time_s[0] == 0.0
-    assert run.error_m[0] == pytest.approx(1.481, abs=MILLIMETRE_M / 2)
-    assert run.index[0] == pytest.approx(0.0156, abs=5e-5)
+    assert run.measures["error_start_m"] == pytest.approx(1.481, abs=MILLIMETRE_M / 2)
+    assert run.measures["remote_manipulability_start"] == pytest.approx(0.0156, abs=5e-5)
 
 
 @pytest.mark.parametrize(
@@ -100,11 +52,11 @@ def test_all_start_where_the_paper_does(figures: dict[str, Figures], name: str) 
     [("paper_free", 135, 197), ("paper_singularity", 97, 135), ("paper_obstacle", 110, 151)],
 )
 def test_the_arms_synchronise_in_the_papers_time(
-    figures: dict[str, Figures], name: str, centimetre_s: float, millimetre_s: float
+    outcomes: dict[str, Outcome], name: str, centimetre_s: float, millimetre_s: float
 ) -> None:
-    run = figures[name]
-    assert run.settled_s(0.01) == pytest.approx(centimetre_s, rel=ONE_PERCENT)
-    assert run.settled_s(0.001) == pytest.approx(millimetre_s, rel=ONE_PERCENT)
+    run = outcomes[name]
+    assert run.measures["settled_1_cm_s"] == pytest.approx(centimetre_s, rel=ONE_PERCENT)
+    assert run.measures["settled_1_mm_s"] == pytest.approx(millimetre_s, rel=ONE_PERCENT)
 
 
 @pytest.mark.parametrize(
@@ -116,10 +68,10 @@ def test_the_arms_synchronise_in_the_papers_time(
     ],
 )
 def test_the_error_falls_as_in_the_figures(
-    figures: dict[str, Figures], name: str, errors_m: tuple[float, ...]
+    outcomes: dict[str, Outcome], name: str, errors_m: tuple[float, ...]
 ) -> None:
-    run = figures[name]
-    seen = [run.error_at_m(time_s) for time_s in (5.0, 10.0, 20.0, 60.0)]
+    run = outcomes[name]
+    seen = [error_at_m(run, time_s) for time_s in (5.0, 10.0, 20.0, 60.0)]
     assert seen == pytest.approx(errors_m, abs=MILLIMETRE_M)
 
 
@@ -132,11 +84,13 @@ def test_the_error_falls_as_in_the_figures(
     ],
 )
 def test_the_remote_arm_ends_as_far_from_singular_as_in_the_figures(
-    figures: dict[str, Figures], name: str, final: float, end_m: tuple[float, float]
+    outcomes: dict[str, Outcome], name: str, final: float, end_m: tuple[float, float]
 ) -> None:
-    run = figures[name]
-    assert run.index[-1] == pytest.approx(final, rel=ONE_PERCENT)
-    assert run.end_m == pytest.approx(end_m, abs=2 * MILLIMETRE_M)  # at 1 mm of error still to go
+    run = outcomes[name]
+    assert run.measures["remote_manipulability_end"] == pytest.approx(final, rel=ONE_PERCENT)
+    assert run.vector("remote_position")[-1] == pytest.approx(
+        end_m, abs=2 * MILLIMETRE_M
+    )  # at 1 mm of error still to go
 
 
 @pytest.mark.parametrize(
@@ -144,30 +98,48 @@ def test_the_remote_arm_ends_as_far_from_singular_as_in_the_figures(
     [("paper_free", 0.130), ("paper_singularity", 0.218), ("paper_obstacle", 0.199)],
 )
 def test_avoidance_keeps_the_midpoints_at_the_safe_radius(
-    figures: dict[str, Figures], name: str, nearest_m: float
+    outcomes: dict[str, Outcome], name: str, nearest_m: float
 ) -> None:
-    assert figures[name].midpoint_m.min() == pytest.approx(nearest_m, abs=MILLIMETRE_M)
+    assert outcomes[name].measures["midpoint_distance_min_m"] == pytest.approx(
+        nearest_m, abs=MILLIMETRE_M
+    )
 
 
 def test_either_sub_task_raises_the_index_and_speeds_up_convergence(
-    figures: dict[str, Figures],
+    outcomes: dict[str, Outcome],
 ) -> None:
-    free = figures["paper_free"]
+    free = outcomes["paper_free"].measures
     for name in ("paper_singularity", "paper_obstacle"):
-        assert figures[name].index[-1] > 1.4 * free.index[-1]
-        assert figures[name].settled_s(0.001) < 0.8 * free.settled_s(0.001)
+        run = outcomes[name].measures
+        assert run["remote_manipulability_end"] > 1.4 * free["remote_manipulability_end"]
+        assert run["settled_1_mm_s"] < 0.8 * free["settled_1_mm_s"]
 
 
 @pytest.mark.parametrize("name", PAPER)
 def test_torques_stay_small_and_the_sub_task_is_followed(
-    figures: dict[str, Figures], name: str
+    outcomes: dict[str, Outcome], name: str
 ) -> None:
-    run = figures[name]
-    assert np.abs(run.torque_nm).max() < 0.26
-    assert run.sub_task_error_rad_s[-1] < 1e-5
+    run = outcomes[name]
+    assert run.measures["remote_torque_max_nm"] < 0.26
+    assert run.measures["sub_task_error_end_rad_s"] < 1e-5
 
 
-def test_task_damping_is_thirty_times_faster(figures: dict[str, Figures]) -> None:
-    run = figures["theorem_b"]
-    assert run.settled_s(0.001) == pytest.approx(6.4, rel=ONE_PERCENT)
-    assert run.settled_s(0.001) < figures["paper_free"].settled_s(0.001) / 30
+@pytest.mark.parametrize(("name", "millimetre_s"), [("theorem_a", 29.7), ("theorem_b", 6.4)])
+def test_sharper_certificates_allow_faster_gains(
+    outcomes: dict[str, Outcome], name: str, millimetre_s: float
+) -> None:
+    assert outcomes[name].measures["settled_1_mm_s"] == pytest.approx(millimetre_s, rel=ONE_PERCENT)
+
+
+def test_task_damping_is_thirty_times_faster(outcomes: dict[str, Outcome]) -> None:
+    free, task = (outcomes[name].measures for name in ("paper_free", "theorem_b"))
+    assert task["settled_1_mm_s"] < free["settled_1_mm_s"] / 30
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_null_space_motion_stays_in_the_null_space(
+    outcomes: dict[str, Outcome], name: str
+) -> None:
+    run = outcomes[name].measures
+    assert (run["null_space_speed_max_rad_s"] > 1e-3) == (name in PAPER and name != "paper_free")
+    assert run["null_space_leak_m_s"] < 1e-12

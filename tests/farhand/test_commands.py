@@ -19,7 +19,7 @@ def farhand(*arguments: str | Path) -> Result:
 
 
 @pytest.mark.parametrize(
-    "command", ["local", "remote", "dashboard", "demo", "simulate", "certify", None]
+    "command", ["local", "remote", "dashboard", "demo", "simulate", "certify", "reproduce", None]
 )
 def test_every_command_offers_help(command: str | None) -> None:
     result = farhand(*([command] if command else []), "--help")
@@ -66,7 +66,7 @@ def test_simulate_ends_with_one_when_a_site_fails(tmp_path: Path) -> None:
 
 def test_simulate_tells_of_a_failure_at_time_zero(tmp_path: Path) -> None:
     session = tmp_path / "session.toml"
-    text = (EXPERIMENTS / "paper_singularity.toml").read_text(encoding="utf-8")
+    text = (EXPERIMENTS / "figure_2.toml").read_text(encoding="utf-8")
     # A singular pose, where the paper's own projector has no value.
     text, count = re.subn(
         r"initial_position_rad = \[[^\]]*,[^\]]*,[^\]]*\]",
