@@ -1,6 +1,7 @@
 """A simulated arm: rigid-body dynamics advanced to the site's clock at every read."""
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -29,7 +30,8 @@ class SimulatedSettings:
     `step_s` is the longest integration step. `encoder_resolution_rad` > 0 quantises the position
     and replaces the exact velocity by its backward difference through a first-order filter of time
     constant `velocity_filter_s`. Friction and `torque_limit_nm` hold for each joint; noise is
-    Gaussian, one standard deviation. With `brakes` the arm stands still while outputs are off.
+    Gaussian, one standard deviation. A written torque acts `torque_delay_s` later, the one before
+    it until then. With `brakes` the arm stands still while outputs are off.
     """
 
     initial_position_rad: tuple[float, ...]
@@ -41,6 +43,7 @@ class SimulatedSettings:
     coulomb_friction_nm: float = 0.0
     viscous_friction_nm_s: float = 0.0
     torque_limit_nm: float | None = None
+    torque_delay_s: float = 0.0
     velocity_noise_rad_s: float = 0.0
     force_noise_n: float = 0.0
     brakes: bool = True
@@ -59,6 +62,7 @@ class SimulatedSettings:
             "velocity_filter_s",
             "coulomb_friction_nm",
             "viscous_friction_nm_s",
+            "torque_delay_s",
             "velocity_noise_rad_s",
             "force_noise_n",
         ):
@@ -76,7 +80,8 @@ class SimulatedDevice:
 
     `read` integrates from the previous reading to now with the last torque held, at most 50 ms of
     it: time beyond is not simulated and adds to `skipped_ns`. One clock step of exactly `step_s`
-    is one integration step, so a manual clock makes runs equal bit for bit. Joints have no stops.
+    is one integration step, so a manual clock makes runs equal bit for bit; a delayed torque that
+    comes into force within it splits it there, to the nanosecond. Joints have no stops.
     """
 
     def __init__(
@@ -101,6 +106,7 @@ class SimulatedDevice:
         self._session_start_ns = session_start_ns
         self._seed = seed
         self._step_ns = round(settings.step_s * 1e9)
+        self._torque_delay_ns = round(settings.torque_delay_s * 1e9)
         self._step = self._step_rk4 if settings.integrator == "rk4" else self._step_semi_implicit
         self._opened = False
         self._enabled = False
@@ -123,7 +129,7 @@ class SimulatedDevice:
         """Switch the outputs on, at zero torque."""
         self._require_open()
         self._advance(self._now_ns())  # what has passed until here passed with the outputs off
-        self._torque = np.zeros(self.joints)
+        self._zero_torque()
         self._enabled = True
 
     def read(self) -> DeviceState:
@@ -142,7 +148,10 @@ class SimulatedDevice:
         return DeviceState(position, velocity, wrench, now_ns)
 
     def write(self, torque_nm: FloatArray) -> None:
-        """Hold these joint torques from the last reading on, within the actuator's limit."""
+        """Hold these joint torques, within the actuator's limit, until others take over.
+
+        They act from the last reading on, or `torque_delay_s` after it.
+        """
         if not self._enabled:
             raise DeviceError("torque refused: the outputs are off; call enable() first")
         if torque_nm.shape != (self.joints,):
@@ -150,12 +159,16 @@ class SimulatedDevice:
         if not np.isfinite(torque_nm).all():
             raise DeviceError(f"torque refused: {torque_nm} N·m is not finite")
         limit = self._settings.torque_limit_nm
-        self._torque = torque_nm.copy() if limit is None else np.clip(torque_nm, -limit, limit)
+        torque = torque_nm.copy() if limit is None else np.clip(torque_nm, -limit, limit)
+        if self._torque_delay_ns > 0:
+            self._pending.append((self._last_ns + self._torque_delay_ns, torque))
+        else:
+            self._torque = torque
 
     def stop(self) -> None:
-        """Zero the torque, switch the outputs off and let the brakes fall in."""
+        """Zero the torque at once, switch the outputs off and let the brakes fall in."""
         self._enabled = False
-        self._torque = np.zeros(self.joints)
+        self._zero_torque()
         if self._settings.brakes:
             self._q_dot = np.zeros(self.joints)
 
@@ -167,12 +180,16 @@ class SimulatedDevice:
     def _reset(self) -> None:
         self._q = np.array(self._settings.initial_position_rad)
         self._q_dot = np.zeros(self.joints)
-        self._torque = np.zeros(self.joints)
+        self._zero_torque()
         self._friction = np.zeros(self.joints)
         self._encoder_rad: FloatArray | None = None
         self._measured_ns = 0
         self._filtered_rad_s = np.zeros(self.joints)
         self._random = np.random.default_rng(self._seed)
+
+    def _zero_torque(self) -> None:
+        self._torque = np.zeros(self.joints)
+        self._pending: deque[tuple[int, FloatArray]] = deque()  # from when on [ns], torque
 
     def _require_open(self) -> None:
         if not self._opened:
@@ -189,9 +206,20 @@ class SimulatedDevice:
         if elapsed_ns > MAX_CATCH_UP_NS:
             self.skipped_ns += elapsed_ns - MAX_CATCH_UP_NS
             elapsed_ns = MAX_CATCH_UP_NS
+        reached_ns = now_ns - elapsed_ns
+        while self._pending and self._pending[0][0] < now_ns:
+            from_ns, torque = self._pending.popleft()
+            if from_ns > reached_ns:
+                self._integrate(reached_ns, from_ns)
+                reached_ns = from_ns
+            self._torque = torque
+        self._integrate(reached_ns, now_ns)
+
+    def _integrate(self, start_ns: int, end_ns: int) -> None:
+        elapsed_ns = end_ns - start_ns
         steps = -(-elapsed_ns // self._step_ns)
         step_s = elapsed_ns / (steps * 1e9)
-        start_s = self._session_s(now_ns - elapsed_ns)
+        start_s = self._session_s(start_ns)
         for step in range(steps):
             q, q_dot = self._step(start_s + step * step_s, step_s)
             # Written so that a NaN too counts as diverged.

@@ -8,6 +8,12 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
+from control_law.sampling import (
+    LIMIT_IMMEDIATE,
+    LIMIT_LATE_DIFFERENCE,
+    LIMIT_LATE_EXACT,
+    damping_ratio,
+)
 from hardware.interface import ContactForce, DeviceConfigurationError, DeviceError, FloatArray
 from hardware.robot_model import PlanarArm, RobotModel, build_robot
 from hardware.simulated import SimulatedDevice, SimulatedSettings
@@ -320,6 +326,117 @@ def test_noise_has_the_size_asked_for() -> None:
     np.testing.assert_array_equal([state.position_rad for state in states], 0.4)  # not felt
 
 
+# Late actuators.
+
+
+def driven(device: SimulatedDevice, clock: Clock, torques_nm: FloatArray, ns: int) -> FloatArray:
+    """A new torque at every reading; the velocities it is read with, (count, n)."""
+    velocities = []
+    for torque_nm in torques_nm:
+        velocities.append(device.read().velocity_rad_s)
+        device.write(torque_nm)
+        clock.ns += ns
+    return np.array(velocities)
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+@pytest.mark.parametrize("delay_s", [0.0, 3e-4, 0.001, 0.0035, 0.02])
+@pytest.mark.parametrize("ns", [MS, 7 * MS])
+def test_torque_acts_on_time(ns: int, delay_s: float, integrator: str) -> None:
+    torques_nm = 0.1 * np.random.default_rng(5).standard_normal((40, 1))
+    device, clock = running(planar(1), integrator=integrator, torque_delay_s=delay_s)
+    velocity = driven(device, clock, torques_nm, ns)[:, 0]
+    # A free bar moves as it would have at once, that much later.
+    time_s = ns * 1e-9 * np.arange(40)
+    at_once = np.cumsum([0.0, *torques_nm[:-1, 0]]) * ns * 1e-9 / BAR_KG_M2
+    expected = np.interp(time_s - delay_s, time_s, at_once)
+    assert np.ptp(expected) > 1e-2
+    np.testing.assert_allclose(velocity, expected, 0.0, 1e-12)
+
+
+@pytest.mark.parametrize("ticks_late", [0, 3])
+def test_a_delay_of_whole_ticks_only_shifts_bit_for_bit(ticks_late: int) -> None:
+    torques_nm = 0.1 * np.random.default_rng(6).standard_normal((200, 3))
+    nothing = np.zeros((ticks_late, 3))
+
+    def run(torques_nm: FloatArray, delay_s: float) -> FloatArray:
+        device, clock = running(
+            planar(3, "point"), Push(wall), coulomb_friction_nm=0.01, torque_delay_s=delay_s
+        )
+        return driven(device, clock, torques_nm, MS)
+
+    np.testing.assert_array_equal(
+        run(torques_nm, 0.001 * ticks_late),
+        run(np.concatenate([nothing, torques_nm])[:200], 0.0),
+    )
+
+
+@pytest.mark.parametrize("again", ["stop", "enable", "reopen"])
+def test_no_torque_on_its_way_survives(again: str) -> None:
+    device, clock = running(planar(1), torque_delay_s=0.0025, brakes=False)
+    device.write(np.array([0.1]))
+    ticks(device, clock, 3)
+    device.write(np.array([0.2]))  # the first acts by now, this is on its way
+    before = ticks(device, clock, 1)[-1, 1]
+    assert before[0] > 0.0
+    if again == "reopen":
+        device.close()
+        device.open()
+        before = np.zeros(1)
+    if again == "stop":
+        device.stop()
+    else:
+        device.enable()
+    np.testing.assert_array_equal(ticks(device, clock, 10)[:, 1], np.broadcast_to(before, (10, 1)))
+
+
+def test_a_torque_due_in_skipped_time_acts_after_it() -> None:
+    device, clock = running(planar(1), torque_delay_s=0.01)
+    device.write(np.array([0.01]))
+    clock.ns += 1050 * MS
+    velocity = device.read().velocity_rad_s
+    assert velocity[0] == pytest.approx(0.01 / BAR_KG_M2 * 0.05)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "resolution_rad", "limit"),
+    [
+        (0.0, 0.0, LIMIT_IMMEDIATE),
+        (0.0, 1e-15, LIMIT_IMMEDIATE),
+        (0.001, 0.0, LIMIT_LATE_EXACT),
+        (0.001, 1e-15, LIMIT_LATE_DIFFERENCE),
+        # Part of a period f: z² − (1 − (1 − f) a) z + f a has its roots inside the circle iff
+        # a < 1/f, for f ≥ ½.
+        (0.00075, 0.0, 4.0 / 3.0),
+        (0.0005, 0.0, 2.0),
+    ],
+)
+@pytest.mark.parametrize(("of_limit", "stable"), [(0.995, True), (1.005, False)])
+def test_a_sampled_damper_is_stable_up_to_its_limit(
+    delay_s: float, resolution_rad: float, limit: float, of_limit: float, stable: bool
+) -> None:
+    model = planar(1)
+    device, clock = running(
+        model,
+        integrator="rk4",  # exact on a free bar; semi-implicit makes the difference exact too
+        encoder_resolution_rad=resolution_rad,
+        velocity_filter_s=0.0,
+        torque_delay_s=delay_s,
+    )
+    M = model.terms(np.zeros(1), np.zeros(1)).M
+    damping_nm_s = of_limit * limit / damping_ratio(0.001, M, np.eye(1))
+    device.read()
+    device.write(np.array([1e-6 * BAR_KG_M2 / 0.001]))  # a kick to 1e-6 rad/s
+    speeds = []
+    for _ in range(2000):
+        clock.ns += MS
+        velocity = device.read().velocity_rad_s
+        device.write(-damping_nm_s * velocity)
+        speeds.append(abs(velocity[0]))
+    first, last = max(speeds[:20]), max(speeds[-20:])
+    assert (last < 0.1 * first) if stable else (last > 10.0 * first)
+
+
 # Lifecycle.
 
 
@@ -464,6 +581,9 @@ def test_divergence_is_reported_and_the_last_sane_state_kept() -> None:
         ({"step_s": 0.0}, r"step_s is 0\.0"),
         ({"step_s": 0.1}, "step_s"),
         ({"coulomb_friction_nm": -1.0}, r"coulomb_friction_nm is -1\.0"),
+        ({"torque_delay_s": -0.001}, r"torque_delay_s is -0\.001"),
+        ({"torque_delay_s": math.inf}, "torque_delay_s"),
+        ({"torque_delay_s": math.nan}, "torque_delay_s"),
         ({"velocity_noise_rad_s": math.inf}, "velocity_noise_rad_s"),
         ({"torque_limit_nm": 0.0}, "torque_limit_nm"),
         ({"torque_limit_nm": math.nan}, "torque_limit_nm"),
