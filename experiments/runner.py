@@ -80,7 +80,7 @@ def _write(file: Path, content: bytes) -> None:
 
 @contextmanager
 def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
-    """Open processes of this machine, or a dask cluster; what has not begun is dropped on an error."""
+    """Open processes here, or a dask cluster; what has not begun is dropped on an error."""
     if scheduler is None:
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
         try:

@@ -296,7 +296,7 @@ def test_integrators_converge_to_mujocos_path(swing: Swing) -> None:
 
 
 def test_recorded_torques_move_mujoco_along_the_recorded_paths() -> None:
-    run = Simulation(load_session(EXPERIMENTS / "paper_singularity.toml")).run(10.0)
+    run = Simulation(load_session(EXPERIMENTS / "theorems.toml")).run(5.0)
     assert run.failures == ()
 
     def check(links: int, rows: RowArray) -> None:
