@@ -62,14 +62,17 @@ class Case:
         return hashlib.blake2b(repr(decisive).encode(), digest_size=16).hexdigest()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What is kept of a case: figures from every tick, and rows `trace_hz` times a second."""
+    """What is kept of a case: figures from every tick, and rows `trace_hz` times a second.
+
+    `energy_j` is V at those rows, (r,), or (0,) where it was not evaluated.
+    """
 
     case: Case
     measures: Measures
     trace: Result
-    energy_j: tuple[float, ...]
+    energy_j: FloatArray
     failures: tuple[str, ...]
 
     @property
@@ -89,6 +92,11 @@ class Outcome:
     def error_m(self) -> FloatArray:
         """Return TTE = X_l − X_r [m], (r, z)."""
         return self.vector("local_position") - self.vector("remote_position")
+
+    def distance_m(self) -> FloatArray:
+        """Return ‖TTE‖ [m], (r,)."""
+        distance_m: FloatArray = np.linalg.norm(self.error_m(), axis=1)
+        return distance_m
 
 
 def run_case(case: Case) -> bytes:
@@ -120,7 +128,9 @@ def read_outcome(case: Case, file: Path) -> Outcome:
     """Read what `run_case` gave; TelemetryError if it is no result file."""
     trace = read_result(file)
     kept = {key: json.loads(trace.metadata[key]) for key in ("measures", "energy_j", "failures")}
-    return Outcome(case, kept["measures"], trace, tuple(kept["energy_j"]), tuple(kept["failures"]))
+    return Outcome(
+        case, kept["measures"], trace, np.array(kept["energy_j"]), tuple(kept["failures"])
+    )
 
 
 def _settled(simulation: Simulation) -> Callable[[Run], bool]:

@@ -43,14 +43,17 @@ def measure(session: Session, run: Run, energy_j: FloatArray) -> Measures:
     error_m = np.linalg.norm(run.local["position_m"] - run.remote["position_m"], axis=1)
     quarter = max(1, len(error_m) // 4)
     end = slice(-min(len(time_s), round(_END_S * session.loop.rate_hz)), None)
+    forces_n = (run.local["external_force_n"] + run.remote["external_force_n"])[end].mean(axis=0)
     figures: Measures = {
         "duration_s": float(time_s[-1]),
         "error_start_m": float(error_m[0]),
         "error_end_m": float(error_m[end].mean()),
+        "error_max_m": float(error_m.max()),
         "error_second_quarter_m": float(error_m[quarter : 2 * quarter].max(initial=0.0)),
         "error_last_quarter_m": float(error_m[-quarter:].max()),
         "settled_1_cm_s": _or_nan(settling_time_s(time_s, error_m, 0.01)),
         "settled_1_mm_s": _or_nan(settling_time_s(time_s, error_m, 0.001)),
+        "force_sum_end_n": float(np.linalg.norm(forces_n)),
         "round_trip_max_s": _extreme(run.local["round_trip_s"], np.max),
         "certified_round_trip_s": float(run.local["certified_round_trip_s"][-1]),
         "sub_task_error_start_rad_s": float(run.remote["sub_task_error_rad_s"][0]),
@@ -66,6 +69,7 @@ def measure(session: Session, run: Run, energy_j: FloatArray) -> Measures:
             f"{site}_torque_max_nm": float(np.abs(rows["torque_nm"]).max()),
             f"{site}_joint_speed_max_rad_s": float(np.abs(rows["q_dot"]).max()),
             f"{site}_coupling_force_max_n": float(np.abs(rows["coupling_force_n"]).max()),
+            f"{site}_age_max_s": _extreme(rows["one_way_delay_s"], np.max),
             f"{site}_manipulability_start": float(rows["manipulability"][0]),
             f"{site}_manipulability_end": float(rows["manipulability"][-1]),
             f"{site}_manipulability_min": float(rows["manipulability"].min()),
