@@ -5,8 +5,8 @@ sample-and-hold, loss and reordering are counted in; K_j = Ω_j p_j′(0); and t
 paper's Theorems 1 and 2. The paper's own proof of (17) has a gap at (14), but (17) implies
 `theorem_a` with a factor of at least four to spare, so it stays a correct sufficient condition.
 
-A hold h̄ of the site's own position (its age when the torque acts) costs as much delay at each
-site as 2h̄ of round trip when the two sites are equally damped.
+A hold h̄ of each site's own position (its age when the torque acts) costs 2h̄ of round trip when the
+two sites are equally damped. Proofs: docs/theory.md.
 """
 
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ def theorem_a(
     """Certify by T√(μ_l μ_r) < 2, μ = sup λ_max(Λ^−½ JᵀKJ Λ^−½).
 
     Uses the joint damping alone, through μ ≤ max_j K_j · Σ_i reach_i²/λ_i, which a planar arm
-    with isotropic K attains when straight. One site's damping pays for the other's. With a hold
+    attains when straight, across the stiffest axis. One site's damping pays for the other's. With a hold
     the condition is (T/2)² < (1/μ_l − h̄)(1/μ_r − h̄).
     """
     spare_l, spare_r = (

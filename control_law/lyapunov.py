@@ -42,6 +42,9 @@ class Energy:
 class LyapunovKrasovskii:
     """V along a motion, one update a step. The past before the first update is at rest.
 
+    α and γ are the same on every axis: gains whose D_l/D_r differs between axes may be certified
+    by Theorem B and yet let this V rise.
+
     V₁ is (9) without the work of the external forces, which the caller adds if there are any.
     V₃ = (1/2α)∫_{−d̄_r}^0∫_{t+γ'}^t Ẋ_rᵀKẊ_r + (1/2γ)∫_{−d̄_l}^0∫_{t+γ'}^t Ẋ_lᵀKẊ_l.
     """

@@ -21,6 +21,11 @@ Measures: TypeAlias = dict[str, float]
 
 _END_S = 0.5
 _POSES_MEASURED = 4000
+_NULL_SPACE = (
+    "null_space_speed_start_rad_s",
+    "null_space_speed_max_rad_s",
+    "null_space_leak_m_s",
+)
 
 
 def settling_time_s(time_s: FloatArray, error_m: FloatArray, limit_m: float) -> float | None:
@@ -130,9 +135,9 @@ def _energy(session: Session, run: Run, energy_j: FloatArray) -> Measures:
 
 
 def _null_space_leak(session: Session, rows: RowArray) -> Measures:
-    """Return max ‖ζ‖ [rad/s] and max ‖Jζ‖ [m/s], which (4) wants zero, over evenly spaced ticks."""
+    """Return ‖ζ‖ [rad/s], and max ‖Jζ‖ [m/s], which (4) wants zero, over evenly spaced ticks."""
     if not session.remote.sub_tasks:
-        return {"null_space_speed_max_rad_s": 0.0, "null_space_leak_m_s": 0.0}
+        return dict.fromkeys(_NULL_SPACE, 0.0)
     every = max(1, len(rows) // _POSES_MEASURED)
     speeds = np.array(
         [
@@ -140,8 +145,8 @@ def _null_space_leak(session: Session, rows: RowArray) -> Measures:
             for terms, zeta in _remote_terms(session, rows[::every])
         ]
     )
-    speed_rad_s, leak_m_s = speeds.max(axis=0).tolist()
-    return {"null_space_speed_max_rad_s": speed_rad_s, "null_space_leak_m_s": leak_m_s}
+    largest = (speeds[0, 0], *speeds.max(axis=0))
+    return dict(zip(_NULL_SPACE, map(float, largest), strict=True))
 
 
 def _remote_terms(session: Session, rows: RowArray) -> Iterator[tuple[RobotTerms, FloatArray]]:
