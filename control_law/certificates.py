@@ -78,8 +78,8 @@ def theorem_a(
     """Certify by T√(μ_l μ_r) < 2, μ = sup λ_max(Λ^−½ JᵀKJ Λ^−½).
 
     Uses the joint damping alone, through μ ≤ max_j K_j · Σ_i reach_i²/λ_i, which a planar arm
-    attains when straight, across the stiffest axis. One site's damping pays for the other's. With a hold
-    the condition is (T/2)² < (1/μ_l − h̄)(1/μ_r − h̄).
+    attains when straight, across the stiffest axis. One site's damping pays for the other's. With
+    a hold the condition is (T/2)² < (1/μ_l − h̄)(1/μ_r − h̄).
     """
     spare_l, spare_r = (
         1.0 / _spectral_bound(coupling, site.damping.joint, site.reach_m) - hold_s

@@ -16,7 +16,8 @@ from site_runtime.session import ObstacleSettings
 
 FloatArray = npt.NDArray[np.float64]
 
-LOCAL, REMOTE, OTHER = "#1f6fb4", "#d9722b", "#4c9a4c"
+COLOURS = ("#1f6fb4", "#d9722b", "#4c9a4c", "#8a56b0", "#c02f2f")
+LOCAL, REMOTE, OTHER = COLOURS[:3]
 _DPI = 100
 _POSES = 14
 _MARGIN_M = 0.08

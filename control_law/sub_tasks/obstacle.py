@@ -23,9 +23,10 @@ class SegmentAvoidance:
 
     Centre (3,) [m], or (2,) for an arm in the plane z = 0; activation distance R [m]; gain κ
     [1/(m²·s)]: the pull on a link is at most κR². g is continuous and bounded, and pushes
-    outwards at every depth but the very centre, d being rounded there over R/100. ġ is exact, and bounded; it jumps only where the closest point
-    passes from a segment's inside to its end, for there the distance itself has a kink in its
-    curvature. The main task has priority: this is no protection, only a preference.
+    outwards at every depth but the very centre, d being rounded there over R/100. ġ is exact, and
+    bounded; it jumps only where the closest point passes from a segment's inside to its end, for
+    there the distance itself has a kink in its curvature. The main task has priority: this is no
+    protection, only a preference.
     """
 
     center: FloatArray

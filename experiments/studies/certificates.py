@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from experiments.case import Case
-from experiments.plots import LOCAL, OTHER, REMOTE, curves, panels, save
+from experiments.plots import COLOURS, curves, panels, save
 from experiments.report import Claim, Figure, Section, Table, Verdict
 from experiments.study import Outcomes, Study
 from site_runtime.certification import certify
@@ -42,18 +42,15 @@ def _section(outcomes: Outcomes, folder: Path) -> Section:
     paper, a, b, late = measures.values()
     by_17, by_a, _ = certified["the paper's Λ, by (17)"]
     figure, (axes,) = panels(1, 1, (8.0, 4.0))
-    curves(
-        axes,
-        outcomes[PAPER.name].time_s,
-        [
-            (label, outcomes[case.name].distance_m(), colour)
-            for (label, case), colour in zip(
-                _ROWS.items(), (LOCAL, OTHER, REMOTE, "#8a56b0"), strict=True
-            )
-        ],
-        "‖TTE‖ [m]",
-        logarithmic=True,
-    )
+    for (label, case), colour in zip(_ROWS.items(), COLOURS, strict=False):
+        outcome = outcomes[case.name]
+        curves(
+            axes,
+            outcome.time_s,
+            [(label, outcome.distance_m(), colour)],
+            "‖TTE‖ [m]",
+            logarithmic=True,
+        )
     save(figure, folder / "certificates.png")
     return Section(
         "The sharper certificates",

@@ -66,7 +66,7 @@ _ROD_LATE_B = Case("hazard_rod_late_task_damping", "theorem_b.toml", 5.0, {**_RO
 
 
 def _more_damping(name: str, one_way_s: float) -> Case:
-    """Damp in proportion to the delay, as (17) has it; the paper's own 0.2 s each way as printed."""
+    """Damp in proportion to the delay, as (17) has it, from the paper's gains at 0.2 s each way."""
     delay: TomlValue = {"model": "constant", "delay_s": one_way_s}
     share = one_way_s / 0.2
     return Case(
@@ -133,11 +133,11 @@ def _section(outcomes: Outcomes, folder: Path) -> Section:
         ),
         (
             "links as rods, one tick of latency, the paper's Λ",
-            f"straight, a = T_s λ_max(M⁻¹Λ) = {rod_ratio:.2f}, limit 1 one tick late"
-            f"{_ended(outcomes[_ROD_LATE.name])}; without the latency, limit 2"
-            f"{_ended(outcomes[_ROD_AT_ONCE.name]) or ', it runs'}",
-            f"task damping by Theorem B: a = {rod_b_ratio:.2f}"
-            f"{_ended(outcomes[_ROD_LATE_B.name]) or ', it runs'}",
+            f"straight, a = T_s λ_max(M⁻¹Λ) = {rod_ratio:.2f}, limit 1 one tick late: joints at "
+            f"{_speed(outcomes[_ROD_LATE.name])}; without the latency, limit 2: "
+            f"{_speed(outcomes[_ROD_AT_ONCE.name])}",
+            f"task damping by Theorem B, a = {rod_b_ratio:.2f}, one tick late: "
+            f"{_speed(outcomes[_ROD_LATE_B.name])}",
         ),
     )
     return Section(
@@ -196,6 +196,10 @@ def _ended(outcome: Outcome) -> str:
     if not outcome.failures:
         return ""
     return f": diverges, fault after {outcome.measures.get('duration_s', 0.0):.2f} s"
+
+
+def _speed(outcome: Outcome) -> str:
+    return f"{outcome.measures['remote_joint_speed_max_rad_s']:.2g} rad/s"
 
 
 def _end_depth(outcome: Outcome) -> float:

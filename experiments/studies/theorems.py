@@ -4,7 +4,7 @@ from pathlib import Path
 
 from experiments.case import Case
 from experiments.measures import Measures
-from experiments.plots import LOCAL, OTHER, REMOTE, curves, panels, save
+from experiments.plots import COLOURS, curves, panels, save
 from experiments.report import Claim, Figure, Section, Table, Verdict
 from experiments.studies.certificates import PAPER, paper_trip_s
 from experiments.study import Outcomes, Study
@@ -92,38 +92,20 @@ def _section(outcomes: Outcomes, folder: Path) -> Section:
         )
     )
     figure, axes = panels(1, 2, (12.0, 4.2))
-    colours = (LOCAL, REMOTE, OTHER, "#8a56b0")
-    curves(
-        axes[0],
-        outcomes[_UNDERDAMPED.name].time_s,
-        [
-            (label, outcome.energy_j, colour)
-            for (label, outcome), colour in zip(certified.items(), colours, strict=True)
-        ]
-        + [("a quarter of the damping", outcomes[_UNDERDAMPED.name].energy_j, "#c02f2f")],
-        "corrected functional V [J]",
-        logarithmic=True,
-    )
-    curves(
-        axes[1],
-        outcomes[_UNDERDAMPED.name].time_s,
-        [
-            (label, outcome.distance_m(), colour)
-            for (label, outcome), colour in zip(certified.items(), colours, strict=True)
-        ]
-        + [("a quarter of the damping", outcomes[_UNDERDAMPED.name].distance_m(), "#c02f2f")],
-        "‖TTE‖ [m]",
-        logarithmic=True,
-    )
-    axes[0].set_ylim(bottom=1e-9)
-    axes[1].set_ylim(bottom=1e-9)
+    shown = {**certified, "a quarter of the damping": outcomes[_UNDERDAMPED.name]}
+    for (label, outcome), colour in zip(shown.items(), COLOURS, strict=True):
+        for place, (title, values) in enumerate(
+            (("corrected functional V [J]", outcome.energy_j), ("‖TTE‖ [m]", outcome.distance_m()))
+        ):
+            curves(axes[place], outcome.time_s, [(label, values, colour)], title, logarithmic=True)
+            axes[place].set_ylim(bottom=1e-9)
     save(figure, folder / "theorems.png")
     return Section(
         "Theorems 1 and 2",
         "Arms of two and three joints, 0.57 m apart, with a sub-task that climbs the "
         "manipulability, under a coupling of 50 N/m certified by Theorem B (docs/theory.md) for "
-        "0.6 s of round trip. V is the corrected functional. Sampled at h, it may rise in a tick by "
-        "½h²q̈ᵀMq̈, the local error of a first-order integrator (docs/theory.md, 8.3): the "
+        "0.6 s of round trip. V is the corrected functional. Sampled at h, it may rise in a tick "
+        "by ½h²q̈ᵀMq̈, the local error of a first-order integrator (docs/theory.md, 8.3): the "
         "largest of each run is its tolerance.",
         (
             Claim(

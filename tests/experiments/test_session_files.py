@@ -1,6 +1,7 @@
 """The session files that come with farhand: valid, certified, and what they claim to be."""
 
 import re
+from dataclasses import replace
 from math import inf, pi
 from pathlib import Path
 
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 from channel.delay import SinusoidDelay
-from control_law.sub_tasks.obstacle_distance import segment_distance
+from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
+from experiments.simulation import Simulation
 from site_runtime.certification import certify, sampling_ratio
 from site_runtime.keys import SiteId
 from site_runtime.parts import robot_of
@@ -31,6 +33,7 @@ def test_the_files_are_there():
     assert {path.stem for path in FILES} >= {
         *("paper_free", "figure_2", "figure_3", "theorem_a", "theorem_b", "theorems"),
         *("demo", "seven_dof"),
+        *("figure_4", "figure_5", "remark_1"),
     }
 
 
@@ -158,3 +161,100 @@ def test_the_demo_s_hand_presses_through_the_wall_within_reach():
     farthest = np.hypot(*(np.array(hand.center_m) + hand.amplitude_m))
     assert farthest < 0.9 * robot_of(session, SiteId.LOCAL).reach_m[0]
     assert max(hand.frequency_hz) * 10.0 > 1.0  # a full turn within ten seconds
+
+
+@pytest.mark.parametrize("name", ["figure_4", "figure_5", "remark_1"])
+def test_the_paper_s_delays_are_certified_by_theorem_b_and_carried_by_the_loop(name):
+    session = load_session(FOLDER / f"{name}.toml")
+    assert session.channel.injection == "exact"
+    for direction in (session.channel.local_to_remote, session.channel.remote_to_local):
+        assert direction.delay == SinusoidDelay(0.1, 0.1, 1.0, 0.0)
+    certification = certify(session)
+    assert certification.best.theorem == "Theorem B"
+    assert certification.best.round_trip_s > 1.15 * certification.injected_round_trip_s
+    for site in SiteId:
+        ratio = sampling_ratio(session, site)
+        assert ratio.advised
+        device = session.site(site).device
+        if device.encoder_resolution_rad > 0.0:  # the filter's pole pair is then well damped
+            assert ratio.ratio * session.loop.rate_hz * device.velocity_filter_s <= 0.5
+
+
+@pytest.mark.parametrize("name", ["figure_4", "figure_5"])
+def test_the_bench_of_section_vi(name):
+    session = load_session(FOLDER / f"{name}.toml")
+    assert session.local.robot.lengths_m == (0.21, 0.252)
+    assert session.remote.robot.lengths_m == (0.254, 0.1405, 0.21, 0.17)
+    for site in (session.local, session.remote):
+        assert site.robot.masses_kg[-2:] == (0.055, 0.075)
+        assert site.robot.gravity_m_s2 == (0.0, 0.0)
+        assert site.device.encoder_resolution_rad * 0.21 == pytest.approx(3e-5, rel=0.05)
+        assert site.device.coulomb_friction_nm / 0.252 == pytest.approx(0.04, rel=0.05)
+        assert site.device.torque_limit_nm / 0.17 == pytest.approx(8.5, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["figure_4", "figure_5", "remark_1"])
+def test_both_robots_start_at_one_point_away_from_singular_poses(name):
+    session = load_session(FOLDER / f"{name}.toml")
+    local, remote = start(session, SiteId.LOCAL), start(session, SiteId.REMOTE)
+    assert np.linalg.norm(local.X - remote.X) < 1e-3
+    for site, terms in ((SiteId.LOCAL, local), (SiteId.REMOTE, remote)):
+        assert np.linalg.norm(terms.X) < 0.9 * robot_of(session, site).reach_m[0]
+    lengths = session.local.robot.lengths_m
+    largest = np.prod(np.square(lengths))
+    assert np.linalg.det(local.J @ local.J.T) > 0.4 * largest
+
+
+def test_only_the_obstacle_tells_figure_5_s_bench_from_figure_4_s():
+    four, five = (load_session(FOLDER / f"figure_{number}.toml") for number in (4, 5))
+    assert four.remote.sub_tasks == four.remote.obstacles == ()
+    (task,), (obstacle,) = five.remote.sub_tasks, five.remote.obstacles
+    assert (task.kind, task.gain) == ("paper_obstacle", 1.0)
+    assert five.remote.null_space.regularisation == 0.0
+    assert five.remote.null_space.rate_limit_rad_s == inf
+    assert obstacle.center_m == (0.3, -0.12)
+    assert (obstacle.safe_radius_m, obstacle.collision_radius_m) == (0.18, 0.1)
+    origins = start(five, SiteId.REMOTE).origins
+    assert midpoint_distance(origins, np.array(obstacle.center_m)) > obstacle.safe_radius_m + 0.05
+    for part in ("coupling", "channel", "engagement", "loop"):
+        assert getattr(four, part) == getattr(five, part)
+    assert replace(four.local, operator=five.local.operator) == five.local
+    for part in ("robot", "damping", "device"):
+        assert getattr(four.remote, part) == getattr(five.remote, part)
+
+
+def test_figure_5_s_hand_leads_the_arm_into_the_obstacle_unless_it_is_avoided():
+    session = load_session(FOLDER / "figure_5.toml")
+    (obstacle,) = session.remote.obstacles
+    unaware = replace(session, remote=replace(session.remote, sub_tasks=()))
+    last_pulse_s = session.local.operator.pulses[-1].end_s
+    nearest = []
+    for variant in (unaware, session):
+        run = Simulation(variant).run(last_pulse_s + 0.5)
+        assert not run.failures
+        nearest.append(run.remote["midpoint_distance_m"].min())
+        error = np.linalg.norm(run.local["position_m"] - run.remote["position_m"], axis=1)
+        assert error.max() < 0.03
+        assert error[-1] < 0.0015
+    without, avoiding = nearest
+    assert without < obstacle.collision_radius_m
+    assert avoiding > 0.95 * obstacle.safe_radius_m
+
+
+def test_remark_1_s_wall_carries_the_hand_s_force():
+    session = load_session(FOLDER / "remark_1.toml")
+    assert session.local.robot.lengths_m == (0.38,) * 2
+    assert session.remote.robot.lengths_m == (0.38,) * 3
+    assert session.local.robot.masses_kg + session.remote.robot.masses_kg == (0.3,) * 5
+    (wall,), hand = session.remote.environment.walls, session.local.operator
+    assert (wall.point_m, wall.normal) == ((0.3, 0.0), (-1.0, 0.0))
+    assert start(session, SiteId.REMOTE).X[0] < wall.point_m[0]
+    assert hand.force_n == (2.5, 0.0)
+    assert hand.start_s >= session.engagement.ramp_s
+    assert session.coupling.force_ceiling_n[0] > hand.force_n[0]
+    run = Simulation(session).run(14.0)
+    assert not run.failures
+    forces = run.local["external_force_n"][-1] + run.remote["external_force_n"][-1]
+    assert np.abs(forces).max() < 1e-3
+    assert run.remote["external_force_n"][-1][0] == pytest.approx(-2.5, abs=1e-3)
+    assert np.abs(run.local["velocity_m_s"][-1]).max() < 1e-5
