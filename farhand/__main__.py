@@ -5,6 +5,7 @@ import typer
 from farhand.certify import certify
 from farhand.dashboard import dashboard
 from farhand.demo import demo
+from farhand.design import design
 from farhand.simulate import simulate
 from local_site.daemon import local
 from remote_site.daemon import remote
@@ -16,7 +17,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (local, remote, dashboard, demo, simulate, certify):
+for command in (local, remote, dashboard, demo, simulate, certify, design):
     app.command()(command)
 
 
