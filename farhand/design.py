@@ -11,7 +11,6 @@ from control_law import sampling
 from farhand.certify import numbers, print_certificates, print_sampling
 from farhand.console import say, user_errors
 from site_runtime.certification import Bound, certify, injected_round_trip_s, sampling_ratio
-from site_runtime.daemon import SessionPath
 from site_runtime.design import Capacity, Design, NoDesign, Wish
 from site_runtime.design import design as design_gains
 from site_runtime.keys import SiteId
@@ -23,7 +22,9 @@ EXIT_NO_DESIGN = 1
 
 
 def design(
-    base: SessionPath,
+    base: Annotated[
+        Path, typer.Argument(metavar="BASE.toml", help="Session with the robots, rate and devices.")
+    ],
     round_trip: Annotated[
         float, typer.Option("--round-trip", help="Round trip to tolerate, ticks included [s].")
     ],
