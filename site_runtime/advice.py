@@ -334,7 +334,7 @@ def _shorter_round_trip(session: Session) -> Iterator[Remedy]:
     channel = session.channel
     certified_s = certify(session).best.round_trip_s / _STRICTLY
     over_s = injected_round_trip_s(session) - certified_s
-    times = dict(_delay_times(session)) if channel.injection != "off" else {}
+    times = dict(_delay_times(session))
     shortened_s = sum(
         direction.bound_s
         for direction in (channel.local_to_remote, channel.remote_to_local)

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from control_law.certificates import Theorem
-from site_runtime.advice import Change, Means, remedies
-from site_runtime.certification import certify, damping_limit, pose_search, sampling_ratio
+from site_runtime.advice import Change, Means, Overload, remedies
+from site_runtime.certification import (
+    DampingLimit,
+    certify,
+    damping_limit,
+    pose_search,
+    sampling_ratio,
+)
 from site_runtime.keys import SiteId
 from site_runtime.parts import damping_of
+from site_runtime.pose_search import FastestMode
 from site_runtime.session import parse_session
 from site_runtime.session_edit import edited
 
@@ -143,6 +150,28 @@ def test_a_site_that_carries_no_more_lets_the_other_pay():
     values = new_values(found)
     local, remote = (values[f"{site}.damping.task_n_s_per_m"][0] for site in ("local", "remote"))
     assert 30.0 < remote < 49.0 < local  # alike it would be (0.082 + 0.001)·600 = 49.8 each
+
+
+@pytest.mark.parametrize("stiffness", [580.0, 600.0, 620.0, 640.0, 660.0])
+def test_at_its_limit_a_site_is_within_it_also_after_rounding(stiffness):
+    changes = ENCODER | {"coupling.stiffness_n_per_m": [stiffness, stiffness]}
+    found = next(r for r in remedies(session_of("demo", changes)) if r.means is Means.TASK_DAMPING)
+    assert len(found.changes) == 2
+    assert not found.overloads
+
+
+def test_no_rate_is_named_that_the_filter_or_a_session_does_not_allow():
+    def rate_hz(mode_per_s, filter_s):
+        limit = DampingLimit(SiteId.LOCAL, 1e-3, filter_s)
+        return Overload(
+            limit, FastestMode(mode_per_s, ()), "local.damping.joint_nm_s", None
+        ).rate_hz
+
+    assert rate_hz(480.0, None) == 1200
+    assert rate_hz(480.0, 0.001) == 1200
+    assert rate_hz(520.0, 0.001) is None
+    assert rate_hz(4000.0, None) == 10_000
+    assert rate_hz(4001.0, None) is None
 
 
 def test_from_no_damping_at_one_site_the_other_counts():

@@ -42,6 +42,15 @@ def test_the_refined_pose_is_worse_than_every_random_one_and_within_the_limits(s
     assert np.array_equal(np.clip(mode.pose_rad, lower, upper), mode.pose_rad)
 
 
+def test_it_stays_within_narrow_limits():
+    session = load_session(EXPERIMENTS / "seven_dof.toml")
+    robot = robot_of(session, SiteId.LOCAL)
+    middle = np.linspace(-0.8, 0.8, robot.joints)
+    robot.position_limits_rad = (middle - 0.1, middle + 0.1)
+    pose = PoseSearch(robot, seed=1).fastest(damping_of(session.local.damping)).pose_rad
+    assert np.abs(pose - middle).max() == pytest.approx(0.1, abs=1e-9)
+
+
 def test_it_is_in_proportion_to_the_damping_and_grows_with_either_kind(seven):
     robot, damping = seven
     search = PoseSearch(robot, seed=1)

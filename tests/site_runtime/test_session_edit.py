@@ -177,11 +177,13 @@ def test_a_file_may_move_to_another_folder(tmp_path):
     trace.write_text("time_s,delay_s\n0.0,0.02\n")
     text = (EXPERIMENTS / "seven_dof.toml").read_text(encoding="utf-8")
     key = "channel.local_to_remote.delay"
-    text = edited(text, {key: {"model": "trace", "path": str(trace)}})
+    changes = {key: {"model": "trace", "path": str(trace)}, "network.zenoh_config": str(trace)}
+    text = edited(text, changes)
     session = parsed(text)
     assert paths_from(session, EXPERIMENTS) == {}
     moves = paths_from(session, tmp_path)
-    assert set(moves) == {"local.robot.path", "remote.robot.path", f"{key}.path"}
+    robots = {"local.robot.path", "remote.robot.path"}
+    assert set(moves) == {*robots, f"{key}.path", "network.zenoh_config"}
     assert moves[f"{key}.path"] == "traces/wifi.csv"
     moved = parse_session(edited(text, moves), tmp_path / "moved.toml")
     assert moved.digest == session.digest
