@@ -36,7 +36,7 @@ def design(
         float | None,
         typer.Option(
             "--force-ceiling",
-            help="Force never exceeded [N]. Left out: the base's, or else the stiffness times 0.1 m.",
+            help="Force never exceeded [N]. Left out: the base's, else 0.1 m times the stiffness.",
         ),
     ] = None,
     margin: Annotated[
