@@ -17,6 +17,9 @@ LIMIT_LATE_EXACT = 1.0  # velocity exact; torque acts one period late
 LIMIT_LATE_DIFFERENCE = 2.0 * (sqrt(2.0) - 1.0)  # difference of positions; one period late
 ADVISED_RATIO = 0.4  # half of the least of them, nearly
 
+# A velocity through a first-order filter τ_f damps the mode λ with the ratio ½/√(λτ_f): 0.71 here.
+ADVISED_FILTER_RATIO = 0.5
+
 
 def damping_ratio(period_s: float, M: FloatArray, Lambda: FloatArray) -> float:
     """Return a = T_s λ_max(M⁻¹Λ) at one pose, for M and Λ (n, n) symmetric, M positive."""

@@ -5,6 +5,7 @@ import typer
 from farhand.certify import certify
 from farhand.dashboard import dashboard
 from farhand.demo import demo
+from farhand.design import design
 from farhand.reproduce import reproduce
 from farhand.simulate import simulate
 from local_site.daemon import local
@@ -17,7 +18,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (local, remote, dashboard, demo, simulate, certify, reproduce):
+for command in (local, remote, dashboard, demo, simulate, certify, design, reproduce):
     app.command()(command)
 
 

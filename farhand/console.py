@@ -26,3 +26,8 @@ def user_errors() -> Iterator[None]:
     except (SessionError, HardwareError, LinkError, TelemetryError, RunnerError, OSError) as error:
         ERR.print(str(error), style="red", highlight=False, markup=False)
         raise typer.Exit(EXIT_USER_ERROR) from None
+
+
+def say(line: str) -> None:
+    """Print one line of markup, however long: keys and numbers are there to be copied."""
+    OUT.print(line, soft_wrap=True, highlight=False)

@@ -10,7 +10,7 @@ Errors::
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -103,5 +103,18 @@ class ContactForce(Protocol):
         """Return the force (z,) [N] on the robot at session time `time_s`, in base axes.
 
         Must depend on its arguments only: an integrator calls it several times a step.
+        """
+        ...
+
+
+@runtime_checkable
+class VelocityByDifference(Protocol):
+    """Settings of a driver that may difference its positions, rather than measure velocity."""
+
+    @property
+    def difference_filter_s(self) -> float | None:
+        """Time constant of the first-order filter on the differences [s]; None: velocity is exact.
+
+        0 is a difference without a filter.
         """
         ...

@@ -39,6 +39,7 @@ class DeviceContext:
 class DriverEntry:
     """A driver: the dataclass of its settings, and the factory (settings, context) → Device.
 
+    Settings of a device whose velocity is a difference of positions are `VelocityByDifference`.
     The factory touches no hardware and may raise DeviceConfigurationError.
     """
 

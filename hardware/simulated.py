@@ -74,6 +74,11 @@ class SimulatedSettings:
                 f"torque_limit_nm is {self.torque_limit_nm}; it must be positive, or left out"
             )
 
+    @property
+    def difference_filter_s(self) -> float | None:
+        """Time constant of the filter on differenced velocities [s]; None: velocity is exact."""
+        return self.velocity_filter_s if self.encoder_resolution_rad > 0.0 else None
+
 
 class SimulatedDevice:
     """An arm that obeys M q̈ + C q̇ + G = τ + JᵀF and the given imperfections; a `Device`.

@@ -61,6 +61,7 @@ from site_runtime.session_settings import (
 )
 
 __all__ = [
+    "PATH_KEYS",
     "ChannelSettings",
     "ConstantOperator",
     "CouplingSettings",
@@ -113,7 +114,12 @@ class Session(SessionFile):
 
 
 _ADAPTER = TypeAdapter(SessionFile)
-_SITES = ("local", "remote")
+PATH_KEYS = (
+    *(f"{site}.robot.path" for site in ("local", "remote")),
+    *(f"channel.{direction}.delay.path" for direction in DIRECTIONS),
+    "network.zenoh_config",
+)
+"""The keys that name files, relative to the session file."""
 
 
 def load_session(path: Path | str) -> Session:
@@ -153,18 +159,12 @@ def parse_session(text: str, path: Path) -> Session:
 
 def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
     """Make the paths absolute, so that nothing depends on where a daemon is started."""
-
-    def table(*keys: str) -> dict[str, Any]:
-        found: Any = document
-        for key in keys:
-            found = found.get(key) if isinstance(found, dict) else None
-        return found if isinstance(found, dict) else {}
-
-    places = [(table(site, "robot"), "path") for site in _SITES]
-    places += [(table("channel", direction, "delay"), "path") for direction in DIRECTIONS]
-    places += [(table("network"), "zenoh_config")]
-    for holder, key in places:
-        if isinstance(holder.get(key), str):
+    for dotted in PATH_KEYS:
+        *tables, key = dotted.split(".")
+        holder: Any = document
+        for table in tables:
+            holder = holder.get(table) if isinstance(holder, dict) else None
+        if isinstance(holder, dict) and isinstance(holder.get(key), str):
             holder[key] = str(folder / holder[key])
 
 

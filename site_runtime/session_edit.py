@@ -1,15 +1,17 @@
 """Session texts changed key by key, the comments and the layout kept."""
 
 import json
+import os
 import re
 import tomllib
 from collections.abc import Mapping, MutableMapping, MutableSequence, Sequence
+from pathlib import Path
 from typing import Any
 
 import tomlkit
 from tomlkit.items import AoT, InlineTable, Table
 
-from site_runtime.session_problems import SessionError
+from site_runtime.session import PATH_KEYS, Session, SessionError
 
 TomlValue = bool | int | float | str | Sequence["TomlValue"] | Mapping[str, "TomlValue"]
 
@@ -39,6 +41,19 @@ def edited(text: str, changes: Mapping[str, TomlValue | None]) -> str:
             "write every table's own tables directly after it"
         )
     return result
+
+
+def paths_from(session: Session, folder: Path) -> dict[str, TomlValue]:
+    """Return the changes that let a session file stand in another folder: the paths it names."""
+    found: dict[str, TomlValue] = {}
+    if folder.resolve() != session.path.resolve().parent:
+        for key in PATH_KEYS:
+            value: Any = session
+            for name in key.split("."):
+                value = getattr(value, name, None)
+            if isinstance(value, str):
+                found[key] = os.path.relpath(value, folder.resolve())
+    return found
 
 
 def _set(root: MutableMapping[str, Any], key: str, value: Any) -> None:  # noqa: ANN401  TOML

@@ -20,6 +20,9 @@ from site_runtime.session_problems import ABSENT, NestedProblems, Problem, expla
 
 _STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
+MOST_HZ = 10_000
+"""The fastest loop that a session may ask for."""
+
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Name = Annotated[
@@ -42,7 +45,7 @@ Locator = Annotated[
 class LoopSettings:
     """The control loop of both sites."""
 
-    rate_hz: Annotated[int, Field(ge=10, le=10_000)] = 1000
+    rate_hz: Annotated[int, Field(ge=10, le=MOST_HZ)] = 1000
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,14 @@ from control_law.certificates import (
     SiteGains,
     best,
     paper_condition,
+    relaxation_theorem_a,
+    relaxation_theorem_b,
     required_joint_damping_paper,
     required_joint_damping_theorem_a,
+    required_relaxation,
+    required_scale,
     required_task_damping_theorem_b,
+    round_trip,
     theorem_a,
     theorem_b,
 )
@@ -166,7 +171,50 @@ def test_the_best_is_the_longest() -> None:
 def test_without_task_damping_theorem_b_certifies_nothing_and_says_so() -> None:
     certificate = theorem_b(PAPER, LOCAL, REMOTE)
     assert certificate.round_trip_s == 0.0
-    assert "none" in certificate.reason
+    assert "no task damping along axis 0 at the local and the remote site" in certificate.reason
+    held = theorem_b(PAPER, LOCAL, gains([3.19] * 3, REACH_R, (0.5, 0.0)), 0.001)
+    assert "no task damping along axis 0 at the local site" in held.reason
+
+
+def test_damping_that_the_hold_uses_up_is_named() -> None:
+    weak = gains([1e-3] * 3, REACH_R, (1.0, 1e-4))
+    damped = gains([0.94] * 2, REACH_L, (1.0, 1.0))
+    reasons = [rule(PAPER, damped, weak, 0.01).reason for rule in (paper_condition, theorem_a)]
+    reasons.append(theorem_b(PAPER, damped, weak, 0.01).reason)
+    assert all("hold of 10 ms" in reason and "remote" in reason for reason in reasons)
+    assert "axis 1" in reasons[-1]
+
+
+RELAXATIONS = np.random.default_rng(3).uniform(0.02, 2.0, (2, 50))
+
+
+@pytest.mark.parametrize("hold_s", [0.0, 0.01])
+def test_the_scale_brings_both_sites_to_the_edge(hold_s: float) -> None:
+    local, remote = RELAXATIONS
+    scale = required_scale(local, remote, 0.4, hold_s)
+    np.testing.assert_allclose(round_trip(scale * local, scale * remote, hold_s), 0.4)
+    # The other root leaves neither site anything beside the hold.
+    assert (scale * np.minimum(local, remote) > hold_s).all()
+
+
+@pytest.mark.parametrize("hold_s", [0.0, 0.01])
+def test_what_one_site_needs_beside_the_other_is_the_edge(hold_s: float) -> None:
+    needed = required_relaxation(RELAXATIONS[0], 0.4, hold_s)
+    np.testing.assert_allclose(round_trip(needed, RELAXATIONS[0], hold_s), 0.4)
+
+
+@pytest.mark.parametrize("hold_s", [0.0, 0.01])
+def test_from_nothing_no_scale_and_beside_nothing_no_damping_is_enough(hold_s: float) -> None:
+    nothing, some = np.zeros(2), np.array([0.0, 1.0])
+    np.testing.assert_array_equal(required_scale(nothing, some, 0.4, hold_s), [np.inf, np.inf])
+    np.testing.assert_array_equal(required_relaxation(nothing, 0.4, hold_s), [np.inf, np.inf])
+
+
+def test_the_relaxations_are_in_proportion_to_damping_over_stiffness() -> None:
+    site = gains([0.5, 0.7], REACH_L, (5.0, 16.0))
+    np.testing.assert_allclose(relaxation_theorem_b(STIFF, site), [0.1, 0.2])
+    expected = 1 / (80 * (0.76**2 / 0.5 + 0.38**2 / 0.7))
+    np.testing.assert_allclose(relaxation_theorem_a(STIFF, site), [expected])
 
 
 @pytest.mark.parametrize("reach", [[0.76], [0.76, 0.0], [0.76, np.inf]])

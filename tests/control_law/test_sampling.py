@@ -8,6 +8,7 @@ import pytest
 
 from control_law.damping import Damping
 from control_law.sampling import (
+    ADVISED_FILTER_RATIO,
     ADVISED_RATIO,
     LIMIT_IMMEDIATE,
     LIMIT_LATE_DIFFERENCE,
@@ -42,6 +43,14 @@ def test_limit_is_the_edge(limit: float, difference: bool, late: bool) -> None:
 
 def test_late_difference_is_0_828() -> None:
     assert pytest.approx(0.828, abs=5e-4) == LIMIT_LATE_DIFFERENCE
+
+
+def test_a_filtered_velocity_damps_the_advised_mode_without_ringing() -> None:
+    """v̇ = −λ v_f, τ_f v̇_f = v − v_f: the poles at λτ_f = ½ are at 45°, the damping ratio 1/√2."""
+    filter_s = 0.0038
+    rate = ADVISED_FILTER_RATIO / filter_s
+    poles = np.linalg.eigvals([[0.0, -rate], [1 / filter_s, -1 / filter_s]])
+    np.testing.assert_allclose(-poles.real / np.abs(poles), np.sqrt(0.5))
 
 
 def test_ratio_is_the_fastest_damped_mode(

@@ -1,25 +1,31 @@
 """The command line, as a person meets it."""
 
 import re
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
 from farhand.__main__ import app
+from site_runtime.certification import certify as certify_session
+from site_runtime.session import load_session
+from site_runtime.session_edit import edited
 from telemetry.result_file import read_result
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 DEMO = EXPERIMENTS / "demo.toml"
 
 
-def farhand(*arguments: str | Path) -> Result:
+def farhand(*arguments: str | float | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize(
-    "command", ["local", "remote", "dashboard", "demo", "simulate", "certify", "reproduce", None]
+    "command",
+    ["local", "remote", "dashboard", "demo", "simulate", "certify", "design", "reproduce", None],
 )
 def test_every_command_offers_help(command: str | None) -> None:
     result = farhand(*([command] if command else []), "--help")
@@ -97,6 +103,132 @@ def test_certify_refuses_a_session_whose_delay_is_too_long(tmp_path: Path) -> No
     result = farhand("certify", session)
     assert result.exit_code == 1
     assert "not certified" in result.output
+
+
+LATE = {f"channel.{way}.delay.mean_s": 0.15 for way in ("local_to_remote", "remote_to_local")}
+CHANGE = re.compile(r"([a-z_]+(?:\.[a-z_]+)+) from (?:\[.*?\]|\S+) to (\[.*?\]|\S+)")
+
+
+def changed_demo(tmp_path: Path, changes: dict[str, Any]) -> Path:
+    session = tmp_path / "session.toml"
+    session.write_text(edited(DEMO.read_text(encoding="utf-8"), changes))
+    return session
+
+
+def test_each_change_that_certify_prints_certifies_when_it_is_made(tmp_path: Path) -> None:
+    session = changed_demo(tmp_path, LATE)
+    result = farhand("certify", session)
+    lines = [line for line in result.output.splitlines() if CHANGE.search(line)]
+    assert len(lines) == 4  # task damping, joint damping, stiffness, round trip
+    for line in lines:
+        changes = {key: tomllib.loads(f"x = {value}")["x"] for key, value in CHANGE.findall(line)}
+        mended = tmp_path / "mended.toml"
+        mended.write_text(edited(session.read_text(), changes))
+        assert farhand("certify", mended).exit_code == 0, line
+        session_text = session.read_text()
+        assert edited(session_text, changes) != session_text
+
+
+def test_certify_numbers_the_cheapest_first_and_says_what_the_rate_does_not_carry(
+    tmp_path: Path,
+) -> None:
+    result = farhand("certify", changed_demo(tmp_path, LATE))
+    assert "1. raise local.damping.task_n_s_per_m from [30, 30] to [36.7, 36.7]" in result.output
+    assert "2. lower coupling.stiffness_n_per_m from [200, 200] to [163, 163]" in result.output
+    assert "not advised: raise local.damping.joint_nm_s" in result.output
+    assert "1000 Hz carries only local.damping.joint_nm_s ≤" in result.output
+
+
+def test_certify_tells_of_the_velocity_filter_where_there_is_one(tmp_path: Path) -> None:
+    encoder = {"remote.device.encoder_resolution_rad": 1e-4}
+    stiff = {"coupling.stiffness_n_per_m": [1000.0, 1000.0]}
+    output = farhand("certify", changed_demo(tmp_path, encoder | stiff)).output
+    assert "remote: velocity filter, τ_f·λ_max(M⁻¹Λ) =" in output
+    assert "local: velocity filter" not in output
+    assert "the velocity filter of 0.0038 s carries only remote.damping" in output
+    assert "velocity filter" not in farhand("certify", DEMO).output
+
+
+def test_certify_tells_where_damping_exceeds_what_the_rate_carries(tmp_path: Path) -> None:
+    paper = farhand("certify", EXPERIMENTS / "paper_free.toml").output
+    assert "a search of 2000" in paper
+    assert re.search(r"remote: a = 0\.74\d, above the advised 0\.4, at \[.*\] rad", paper)
+    heavy = changed_demo(tmp_path, {"local.damping.task_n_s_per_m": [400.0, 400.0]})
+    assert "UNSTABLE with one tick of latency" in farhand("certify", heavy).output
+
+
+@pytest.mark.parametrize("base", ["demo", "seven_dof", "paper_free"])
+def test_design_writes_a_session_that_certify_accepts(base: str, tmp_path: Path) -> None:
+    out = tmp_path / "stiffer.toml"
+    wish = ("--round-trip", 0.45, "--stiffness", 120, "--margin", 1.1, "--out", out)
+    result = farhand("design", EXPERIMENTS / f"{base}.toml", *wish)
+    assert result.exit_code == 0, result.output
+    assert "is certified" in result.output
+    assert "injects" not in result.output
+    session = load_session(out)
+    assert session.name == "stiffer"
+    assert certify_session(session).best.round_trip_s > 1.1 * 0.45
+    assert farhand("certify", out).exit_code == 0
+    text = (EXPERIMENTS / f"{base}.toml").read_text(encoding="utf-8")
+    assert re.findall("#.*", out.read_text()) == re.findall("#.*", text)
+
+
+def test_design_says_when_the_session_injects_more_than_was_wanted(tmp_path: Path) -> None:
+    def output(round_trip: float) -> str:
+        out = tmp_path / "new.toml"
+        wish = ("--round-trip", round_trip, "--stiffness", 100, "--out", out, "--force")
+        result = farhand("design", DEMO, *wish)
+        assert result.exit_code == 0
+        return result.output
+
+    assert "injects up to 164.0 ms, more than wanted: with that it is not certified" in output(0.1)
+    assert "injects up to 164.0 ms, more than wanted: with that it is still cert" in output(0.15)
+    assert "more than wanted" not in output(0.165)
+
+
+def test_design_says_why_there_is_none_and_what_there_would_be(tmp_path: Path) -> None:
+    out = tmp_path / "new.toml"
+
+    def result(stiffness: str) -> Result:
+        return farhand("design", DEMO, "--round-trip", 0.4, "--stiffness", stiffness, "--out", out)
+
+    refused = result("800")
+    assert refused.exit_code == 1
+    assert not out.exists()
+    assert "asks for a task damping of 193 N·s/m" in refused.output
+    for site in ("local", "remote"):
+        assert re.search(rf"{site} carries \S+ N·s/m at 1000 Hz .*worst pose is \[", refused.output)
+    stated = re.search(r"--stiffness (\S+)", refused.output)
+    assert stated is not None
+    assert re.search(r"--round-trip 0\.\d+", refused.output)
+    assert re.search(r"loop\.rate_hz = \d+", refused.output)
+    assert result(stated[1]).exit_code == 0
+    assert out.exists()
+
+
+def test_design_refuses_to_overwrite_unless_told_to(tmp_path: Path) -> None:
+    out = tmp_path / "new.toml"
+    out.write_text("mine")
+    wish = ("design", DEMO, "--round-trip", 0.2, "--stiffness", 100, "--out", out)
+    assert farhand(*wish).exit_code == 2
+    assert out.read_text() == "mine"
+    assert farhand(*wish, "--force").exit_code == 0
+    assert load_session(out).coupling.stiffness_n_per_m == (100.0, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("out", "stiffness"),
+    [("no good name.toml", 100), ("nowhere/new.toml", 100), ("new.toml", 0), ("new.toml", "nan")],
+)
+def test_design_refuses_what_cannot_be_before_it_writes(
+    out: str, stiffness: object, tmp_path: Path
+) -> None:
+    path = tmp_path / out
+    wish = ("design", DEMO, "--round-trip", "0.2", "--stiffness", str(stiffness), "--out", path)
+    result = farhand(*wish)
+    assert result.exit_code == 2
+    assert isinstance(result.exception, SystemExit)
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("command", ["local", "remote", "dashboard", "simulate", "certify"])

@@ -14,7 +14,13 @@ from control_law.sampling import (
     LIMIT_LATE_EXACT,
     damping_ratio,
 )
-from hardware.interface import ContactForce, DeviceConfigurationError, DeviceError, FloatArray
+from hardware.interface import (
+    ContactForce,
+    DeviceConfigurationError,
+    DeviceError,
+    FloatArray,
+    VelocityByDifference,
+)
 from hardware.robot_model import PlanarArm, RobotModel, build_robot
 from hardware.simulated import SimulatedDevice, SimulatedSettings
 
@@ -293,6 +299,14 @@ def test_encoder_velocity_is_a_filtered_difference() -> None:
         expected += 0.001 / (0.001 + 0.003) * ((after - before) / 0.001 - expected)
         assert velocity == pytest.approx(expected, abs=1e-9)
     assert np.ptp(path[:, 1]) > 1.0
+
+
+def test_the_settings_tell_whether_velocity_is_a_filtered_difference() -> None:
+    exact = SimulatedSettings((0.0,), velocity_filter_s=0.003)
+    encoder = SimulatedSettings((0.0,), encoder_resolution_rad=1e-3, velocity_filter_s=0.003)
+    assert isinstance(exact, VelocityByDifference)
+    assert exact.difference_filter_s is None
+    assert encoder.difference_filter_s == 0.003
 
 
 def test_reading_twice_at_one_instant_changes_nothing() -> None:

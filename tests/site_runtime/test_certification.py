@@ -1,11 +1,18 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from control_law import sampling
-from site_runtime.certification import SamplingRatio, certify, sampling_ratio
+from site_runtime.certification import (
+    Bound,
+    DampingLimit,
+    SamplingRatio,
+    certify,
+    damping_limit,
+    sampling_ratio,
+)
 from site_runtime.keys import SiteId
 from site_runtime.session import ChannelSettings, DampingSettings, Session, load_session
 
@@ -90,3 +97,39 @@ def test_the_verdict_is_at_the_edge() -> None:
     assert not SamplingRatio(SiteId.LOCAL, np.nextafter(advised, 1.0), ()).advised
     assert SamplingRatio(SiteId.LOCAL, np.nextafter(limit, 0.0), ()).stable
     assert not SamplingRatio(SiteId.LOCAL, limit, ()).stable
+
+
+def test_the_filter_counts_where_positions_are_differenced(paper: Session) -> None:
+    exact = sampling_ratio(paper, SiteId.LOCAL)
+    assert exact.filter_ratio is None
+    assert damping_limit(paper, SiteId.LOCAL).bound is Bound.SAMPLING
+    device = replace(paper.local.device, encoder_resolution_rad=1e-4, velocity_filter_s=0.003)
+    session = replace(paper, local=replace(paper.local, device=device))
+    differenced = sampling_ratio(session, SiteId.LOCAL)
+    assert differenced.filter_ratio == pytest.approx(3.0 * exact.ratio)
+    assert damping_limit(session, SiteId.LOCAL).rate_per_s == pytest.approx(0.5 / 0.003)
+    assert damping_limit(session, SiteId.REMOTE).rate_per_s == pytest.approx(400.0)
+
+
+def test_a_driver_that_does_not_tell_is_taken_to_measure_velocity(paper: Session) -> None:
+    @dataclass(frozen=True)
+    class Silent:
+        driver: str = "silent"
+
+    session = replace(paper, local=replace(paper.local, device=Silent()))
+    assert damping_limit(session, SiteId.LOCAL).filter_s is None
+
+
+def test_the_tighter_bound_is_the_limit() -> None:
+    assert DampingLimit(SiteId.LOCAL, 1e-3, None).rate_per_s == pytest.approx(400.0)
+    assert DampingLimit(SiteId.LOCAL, 1e-3, 0.0).bound is Bound.SAMPLING
+    fast = DampingLimit(SiteId.LOCAL, 1e-3, 0.001)
+    assert (fast.rate_per_s, fast.bound) == (pytest.approx(400.0), Bound.SAMPLING)
+    slow = DampingLimit(SiteId.LOCAL, 1e-3, 0.002)
+    assert (slow.rate_per_s, slow.bound) == (pytest.approx(250.0), Bound.FILTER)
+
+
+def test_a_filter_too_slow_is_not_advised() -> None:
+    limit = sampling.ADVISED_FILTER_RATIO
+    assert SamplingRatio(SiteId.LOCAL, 0.1, (), limit).advised
+    assert not SamplingRatio(SiteId.LOCAL, 0.1, (), np.nextafter(limit, 1.0)).advised

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from site_runtime.session import SessionError, parse_session
-from site_runtime.session_edit import edited
+from site_runtime.session_edit import edited, paths_from
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 FILES = sorted(EXPERIMENTS.glob("*.toml"))
@@ -169,6 +169,25 @@ def test_values_that_come_out_otherwise_are_refused(monkeypatch):
     monkeypatch.setattr(tomlkit, "parse", lambda text: tomlkit.loads(text.replace("true", "false")))
     with pytest.raises(SessionError, match="layout"):
         edited("a = true\nb = 1\n", {"b": 2})
+
+
+def test_a_file_may_move_to_another_folder(tmp_path):
+    trace = tmp_path / "traces" / "wifi.csv"
+    trace.parent.mkdir()
+    trace.write_text("time_s,delay_s\n0.0,0.02\n")
+    text = (EXPERIMENTS / "seven_dof.toml").read_text(encoding="utf-8")
+    key = "channel.local_to_remote.delay"
+    changes = {key: {"model": "trace", "path": str(trace)}, "network.zenoh_config": str(trace)}
+    text = edited(text, changes)
+    session = parsed(text)
+    assert paths_from(session, EXPERIMENTS) == {}
+    moves = paths_from(session, tmp_path)
+    robots = {"local.robot.path", "remote.robot.path"}
+    assert set(moves) == {*robots, f"{key}.path", "network.zenoh_config"}
+    assert moves[f"{key}.path"] == "traces/wifi.csv"
+    moved = parse_session(edited(text, moves), tmp_path / "moved.toml")
+    assert moved.digest == session.digest
+    assert Path(moved.local.robot.path).samefile(session.local.robot.path)
 
 
 NAMES = st.sampled_from(["a", "b", "c-d", "e_1"])
