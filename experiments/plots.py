@@ -1,6 +1,7 @@
 """The studies' figures; the only module that imports matplotlib."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 
 COLOURS = ("#1f6fb4", "#d9722b", "#4c9a4c", "#8a56b0", "#c02f2f")
 LOCAL, REMOTE, OTHER = COLOURS[:3]
-_DPI = 100
+_DPI = 90
 _POSES = 14
 _MARGIN_M = 0.08
 _DELAYS_SHOWN_S = 20.0
@@ -32,7 +33,7 @@ def panels(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figur
 
 def save(figure: Figure, file: Path) -> None:
     """Write a PNG file; the same figure gives the same bytes."""
-    figure.savefig(file, dpi=_DPI, metadata={"Software": None})
+    figure.savefig(file, dpi=_DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
 
 
 def curves(
@@ -153,4 +154,50 @@ def synchronisation_figure(file: Path, outcome: Outcome, title: str) -> None:
             (("local", local[:, axis], LOCAL), ("remote", remote[:, axis], REMOTE)),
             f"end effectors in {component} [m]",
         )
+    save(figure, file)
+
+
+@dataclass(frozen=True, slots=True)
+class MapPoint:
+    """One simulated pair of stiffness and round trip: converged, slow or diverged."""
+
+    stiffness_n_per_m: float
+    round_trip_s: float
+    verdict: str
+    certified: bool
+
+
+_MARKS = {"converged": ("o", "#2f9e44"), "slow": ("D", "#f0a500"), "diverged": ("X", "#c02f2f")}
+
+
+def map_figure(
+    file: Path,
+    maps: Sequence[tuple[str, Sequence[MapPoint], Mapping[str, Sequence[tuple[float, float]]]]],
+) -> None:
+    """Draw maps side by side: title, points, and certified round trip over stiffness by theorem."""
+    figure, axes = panels(1, len(maps), (5.4 * len(maps), 4.8))
+    for place, (title, points, limits) in zip(axes, maps, strict=True):
+        for (theorem, limit), colour in zip(limits.items(), COLOURS, strict=False):
+            place.plot(*np.array(limit).T, color=colour, linewidth=1.5, label=theorem)
+        for verdict, (marker, colour) in _MARKS.items():
+            chosen = [point for point in points if point.verdict == verdict]
+            place.scatter(
+                [point.stiffness_n_per_m for point in chosen],
+                [point.round_trip_s for point in chosen],
+                marker=marker,
+                color=colour,
+                s=[70.0 if point.certified else 28.0 for point in chosen],
+                label=verdict,
+                zorder=3,
+            )
+        place.set_xscale("log")
+        place.set_yscale("log")
+        trips_s = [point.round_trip_s for point in points]
+        place.set_ylim(0.6 * min(trips_s), 1.7 * max(trips_s))
+        place.set_title(title, fontsize=10)
+        place.set_xlabel("stiffness K [N/m]", fontsize=9)
+        place.set_ylabel("round trip T [s]", fontsize=9)
+        place.tick_params(labelsize=8)
+        place.grid(alpha=0.3, which="both")
+        place.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
     save(figure, file)

@@ -8,6 +8,7 @@ from experiments.studies import (
     figure_5,
     hazards,
     remark_1,
+    stability_map,
     theorems,
 )
 from experiments.study import Study
@@ -21,4 +22,5 @@ STUDIES: tuple[Study, ...] = (
     theorems.STUDY,
     certificates.STUDY,
     hazards.STUDY,
+    stability_map.STUDY,
 )
