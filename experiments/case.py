@@ -24,9 +24,10 @@ SETTLED_M = 1e-3
 FloatArray = npt.NDArray[np.float64]
 _OF_VECTOR = re.compile(r"_([xyz]|\d+)$")
 _SETTLED_FOR_S = 1.0
-_PACKAGES = (
-    *("channel", "control_law", "experiments", "hardware", "local_site", "remote_site"),
-    *("site_runtime", "telemetry"),
+# What a run goes through: neither how studies are told nor how they are drawn
+_SOURCES = (
+    *("channel", "control_law", "hardware", "local_site", "remote_site", "site_runtime"),
+    *("telemetry", "experiments/case.py", "experiments/measures.py", "experiments/simulation.py"),
 )
 
 
@@ -149,7 +150,8 @@ def _settled(simulation: Simulation) -> Callable[[Run], bool]:
 def _source_digest() -> str:
     """Digest of the code that a run goes through."""
     digest = hashlib.blake2b(digest_size=16)
-    for package in _PACKAGES:
-        for file in sorted((EXPERIMENTS.parent / package).rglob("*.py")):
+    for source in _SOURCES:
+        path = EXPERIMENTS.parent / source
+        for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()
