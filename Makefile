@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: demo test lint format screenshot lock clean
+.PHONY: demo test lint format screenshot reproduce lock clean
 
 demo: $(READY)  ## both sites on this machine, with the dashboard, until Ctrl-C
 	$(BIN)/farhand demo $(ARGS)
@@ -23,6 +23,9 @@ format: $(READY)
 
 screenshot: $(READY)  ## the dashboard's picture in the README
 	$(BIN)/farhand demo --duration 24 --screenshot docs/dashboard.png
+
+reproduce: $(READY)  ## the paper's figures and claims, into docs/reproduction
+	$(BIN)/farhand reproduce all --out docs/reproduction
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "farhand needs Python 3.11 or later, this is " + sys.version.split()[0])'
