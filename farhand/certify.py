@@ -71,6 +71,11 @@ def print_certificates(session: Session, result: Certification) -> None:
         f"(packet spacing and ticks included, the network's own delay not); "
         f"margin {result.margin_s * 1e3:.1f} ms"
     )
+    if any(
+        direction.loss is not None
+        for direction in (session.channel.local_to_remote, session.channel.remote_to_local)
+    ):
+        say("[yellow]losses are not in it[/yellow]: a burst adds its length to the round trip")
 
 
 def print_sampling(session: Session, ratios: list[SamplingRatio]) -> None:

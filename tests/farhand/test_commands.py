@@ -96,6 +96,12 @@ def test_certify_names_the_theorem(session: str, theorem: str) -> None:
     assert f"certified by {theorem}" in result.output
 
 
+@pytest.mark.parametrize(("session", "told"), [("seven_dof", True), ("demo", False)])
+def test_certify_tells_that_losses_are_not_in_the_round_trip(session: str, told: bool) -> None:
+    result = farhand("certify", EXPERIMENTS / f"{session}.toml")
+    assert ("losses are not in it" in result.output) is told
+
+
 def test_certify_refuses_a_session_whose_delay_is_too_long(tmp_path: Path) -> None:
     session = tmp_path / "session.toml"
     text = DEMO.read_text(encoding="utf-8")
