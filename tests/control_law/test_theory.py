@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import atan, pi, sqrt
+from math import atan, ceil, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,12 @@ from control_law.control import control_torque
 from control_law.coupling import Coupling
 from control_law.damping import Damping
 from control_law.null_space import manipulability, null_space_velocity
-from control_law.sampling import LIMIT_IMMEDIATE, LIMIT_LATE_DIFFERENCE, damping_ratio
+from control_law.sampling import (
+    LIMIT_IMMEDIATE,
+    LIMIT_LATE_DIFFERENCE,
+    LIMIT_LATE_EXACT,
+    damping_ratio,
+)
 from control_law.saturation import Arctangent
 
 FloatArray = npt.NDArray[np.float64]
@@ -28,6 +33,33 @@ def weights(
 ) -> tuple[float | FloatArray, float | FloatArray]:
     """c_l, c_r of Lemma 4."""
     return 0.5 * (alpha * delay_r + delay_l / gamma), 0.5 * (gamma * delay_l + delay_r / alpha)
+
+
+# Lemma 1: the age of the newest-stamped packet that has arrived, just before the next tick.
+
+
+@pytest.mark.parametrize("losses", [0, 1, 3])
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+def test_no_sample_in_use_is_older_than_lemma_1_says(losses: int, jitter: float) -> None:
+    spacing_s, transit_s, tick_s = 0.01, 0.05, 0.0041
+    rng = np.random.default_rng(0)
+
+    def shortened(longest: float, count: int) -> FloatArray:
+        return longest * (1.0 - jitter * rng.uniform(0.0, 1.0, count))
+
+    stamps = shortened(spacing_s, 20_000).cumsum()
+    arrivals = stamps + shortened(transit_s, len(stamps))
+    # every run of losses as long as allowed
+    delivered = np.arange(len(stamps)) % (losses + 1) == 0
+    ticks = (1.0 + shortened(tick_s, 9000).cumsum()).clip(max=stamps[-1])
+    order = np.argsort(arrivals[delivered])
+    newest = np.maximum.accumulate(stamps[delivered][order])
+    used = newest[np.searchsorted(arrivals[delivered][order], ticks[:-1], "right") - 1]
+    oldest = (ticks[1:] - used).max()
+    bound = transit_s + (1 + losses) * spacing_s + tick_s
+    assert oldest <= bound
+    if jitter == 0.0:
+        assert oldest > bound - 0.05 * tick_s
 
 
 # Section 2: the gap at (14), at a constant speed v over the delay d, e_l = vd/2 = −e_l⁰.
@@ -106,8 +138,9 @@ def test_the_papers_condition_implies_theorem_a_four_times_over(data: st.DataObj
     ]
     slope = data.draw(arrays(np.float64, 2, elements=st.floats(0.01, 1.0)))
     coupling = Coupling.paper(data.draw(positive(2)), slope)
-    printed = paper_condition(coupling, *sites).round_trip_s
-    assert theorem_a(coupling, *sites).round_trip_s >= 4.0 * printed * (1 - 1e-12)
+    hold_s = data.draw(st.sampled_from([0.0, 1e-6, 1e-3]))  # Section 8.1: with a hold too
+    printed = paper_condition(coupling, *sites, hold_s).round_trip_s
+    assert theorem_a(coupling, *sites, hold_s).round_trip_s >= 4.0 * printed * (1 - 1e-12)
 
 
 def positive(n: int) -> st.SearchStrategy[FloatArray]:
@@ -167,7 +200,22 @@ def test_at_a_damping_of_a_singular_value_the_damped_inverse_is_at_its_worst() -
     assert np.linalg.norm(J @ N, 2) == pytest.approx(0.5 * damping)
 
 
-# Section 8.2: a filter on the velocity lowers the limit of a late damper.
+# Section 8.2: lateness, and a filter on the velocity, lower the limit of a sampled damper.
+
+
+@pytest.mark.parametrize(
+    ("late", "limit"), [(0, LIMIT_IMMEDIATE), (1, LIMIT_LATE_EXACT), (2, 0.618034), (3, 0.445042)]
+)
+def test_the_limit_of_an_exact_damper_some_periods_late(late: int, limit: float) -> None:
+    assert limit == pytest.approx(2.0 * sin(pi / (4 * late + 2)), rel=1e-6)
+
+    def radius(a: float) -> float:
+        characteristic = np.zeros(late + 2)  # z^(n+1) − z^n + a
+        characteristic[:2] = 1.0, -1.0
+        characteristic[-1] += a
+        return float(np.abs(np.roots(characteristic)).max())
+
+    assert radius(0.998 * limit) < 1.0 < radius(1.002 * limit)
 
 
 @pytest.mark.parametrize(
@@ -182,6 +230,24 @@ def test_at_a_damping_of_a_singular_value_the_damped_inverse_is_at_its_worst() -
 def test_the_limit_of_a_filtered_damper(share: float, late: bool, limit: float) -> None:
     assert spectral_radius(0.998 * limit, share, late) < 1.0
     assert spectral_radius(1.002 * limit, share, late) > 1.0
+
+
+@given(*[st.floats(-3.0, 3.0)] * 4)
+def test_a_filtered_damper_on_a_spring_is_stable_however_slow_the_filter(
+    log_mass: float, log_damping: float, log_stiffness: float, log_filter: float
+) -> None:
+    mass, damping, stiffness, filter_s = 10.0 ** np.array(
+        [log_mass, log_damping, log_stiffness, log_filter]
+    )
+    dynamics = [
+        [0.0, 1.0, 0.0],
+        [-stiffness / mass, 0.0, -damping / mass],
+        [0.0, 1.0 / filter_s, -1.0 / filter_s],
+    ]
+    printed = [mass * filter_s, mass, damping + stiffness * filter_s, stiffness]
+    np.testing.assert_allclose(np.poly(dynamics), np.divide(printed, printed[0]), rtol=1e-6)
+    cubic, square, linear, constant = printed
+    assert square * linear > cubic * constant  # Routh
 
 
 def spectral_radius(a: float, share: float, late: bool) -> float:
@@ -210,8 +276,23 @@ class Tick:
     R_X: float
     R_M: float
     R_M_expanded: float
+    R_K: float
     kappa_bound: float
     displacement: FloatArray
+
+
+TRIP_COST_S = 0.2  # c + h of R_K, with K = 1
+
+
+def largest_second_derivative(lengths: FloatArray) -> float:
+    """κ_X of a planar arm: all links' centripetal terms in line."""
+    angles = np.tri(len(lengths))
+    return float(np.linalg.eigvalsh((angles.T * lengths) @ angles)[-1])
+
+
+def test_the_printed_second_derivatives() -> None:
+    assert largest_second_derivative(np.full(3, 0.38)) == pytest.approx(1.919, abs=5e-4)
+    assert largest_second_derivative(np.full(2, 0.38)) == pytest.approx(0.995, abs=5e-4)
 
 
 def tick(
@@ -229,9 +310,8 @@ def tick(
     eps = 1e-6
     ahead, behind = (chain.terms(q + side * v_next, v).M for side in (eps, -eps))
     second_order = after.M - M - h * (ahead - behind) / (2 * eps)
-    kappa = np.linalg.eigvalsh(
-        sum(L * np.outer(c, c) for L, c in zip(chain.lengths, np.tri(len(q)), strict=True))
-    )[-1]
+    kappa = largest_second_derivative(chain.lengths)
+    mean_velocity, X_dot = displacement / h, J @ v_next
     shared = -float(displacement @ force) + R_X + R_M
     a = damping_ratio(h, M, Lambda)
     return Tick(
@@ -245,6 +325,7 @@ def tick(
             - h**3 * v_next @ chain.terms(q, q_ddot).C @ q_ddot
             + 0.5 * v_next @ second_order @ v_next
         ),
+        R_K=h * TRIP_COST_S * float(mean_velocity @ mean_velocity - X_dot @ X_dot),
         kappa_bound=0.5 * h * h * kappa * float(v_next @ v_next) * float(np.linalg.norm(force)),
         displacement=displacement,
     )
@@ -264,7 +345,7 @@ def test_the_energy_of_one_tick_is_accounted_for(
     assert whole.rise <= whole.proposition_4 + 1e-14
     assert abs(whole.R_X) <= whole.kappa_bound + 1e-18
     assert pytest.approx(whole.R_M_expanded, rel=1e-4, abs=1e-13) == whole.R_M
-    for name in ("R_X", "R_M"):  # of second order in h
+    for name in ("R_X", "R_M", "R_K"):  # of second order in h
         assert getattr(half, name) == pytest.approx(getattr(whole, name) / 4, rel=0.1, abs=1e-10)
 
 
@@ -287,8 +368,9 @@ PERIOD_S, STIFFNESS, FLOOR = 1e-3, 50.0, 0.05
 def sampled_energies(
     ages: tuple[int, int], ratio: float, share: float, lopsided: float, steps: int = 2000
 ) -> FloatArray:
-    """W of Theorem S at every tick of two masses on a line, the ages of samples jumping at random.
+    """W of Theorem S at every tick of two masses on a line.
 
+    Of the samples young enough, each site gets the one that pulls it on hardest, or any.
     Damping is `share` of the least that the theorem allows; `ratio` is a = h(D + Λ₀)/m.
     """
     h, rng = PERIOD_S, np.random.default_rng(0)
@@ -309,8 +391,11 @@ def sampled_energies(
         )
         stored = 0.5 * float((mass - 0.5 * h * damping) @ np.square(v))
         energies.append(stored + coupling.energy(X[:1] - X[1:]) + transit)
-        seen = np.array([past[max(0, len(past) - 1 - rng.integers(0, age + 1))][site]
-                         for site, age in enumerate(ages)])  # fmt: skip
+        seen = np.empty(2)
+        for site, age in enumerate(ages):
+            young = [sample[site] for sample in past[-1 - age :]]
+            worst = max(young) if v[1 - site] > 0.0 else min(young)
+            seen[site] = worst if rng.random() < 0.5 else rng.choice(young)
         force = np.array([coupling.force(np.array([e]))[0] for e in X - seen[::-1]])
         v_next = v - h / mass * (force + damping * v)
         step = 0.5 * h * (v + v_next)
@@ -334,3 +419,18 @@ def test_theorem_s_past_its_edges() -> None:
     assert np.abs(W).max() > 1e9 * W[0]
     W = sampled_energies((40, 40), 0.02, 0.9, 1.0)
     assert np.diff(W).max() > 1e-7 * W[0]
+
+
+# Section 10: what one site sees of the round trip may be little more than half of T.
+
+
+def test_a_site_may_see_half_of_the_round_trip() -> None:
+    def ticks_old(delay_s: float) -> int:
+        return ceil(round(delay_s / PERIOD_S, 6))
+
+    seen = 0
+    for now in range(7000):
+        back = ticks_old(0.1 - 0.1 * sin(now * PERIOD_S))
+        there = ticks_old(0.1 + 0.1 * sin((now - back) * PERIOD_S))
+        seen = max(seen, back + there)
+    assert seen * PERIOD_S == pytest.approx(0.215)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -126,6 +128,24 @@ def test_at_its_limit_it_pulls_straight_to_the_path() -> None:
     aside = np.array([0.3, -0.4])
     force = hand.force_n(time_s, path_m(time_s) + aside, path_m_s(time_s))
     assert force == pytest.approx([-25.0 * 0.6, 25.0 * 0.8], abs=1e-4)
+
+
+@given(
+    size=st.tuples(st.floats(0.001, 0.5), st.floats(0.001, 0.5)),
+    phase_rad=st.floats(0.0, 6.0),
+    rate_rad_s=st.floats(0.1, 50.0),
+)
+def test_a_hand_that_stands_still_is_passive_at_its_limit_too(
+    size: tuple[float, float], phase_rad: float, rate_rad_s: float
+) -> None:
+    hand = HumanArm(replace(HAND, amplitude_m=(0.0, 0.0)))
+    work = []
+    for angle in np.linspace(0.0, 2 * np.pi, 300, endpoint=False):
+        angles = angle + np.array([0.0, phase_rad])
+        position = np.array(HAND.center_m) + np.array(size) * np.sin(angles)
+        velocity = rate_rad_s * np.array(size) * np.cos(angles)
+        work.append(hand.force_n(GRIPPED_S, position, velocity) @ velocity)
+    assert sum(work) <= 1e-3 * np.abs(work).sum()
 
 
 def test_it_takes_hold_smoothly_from_its_start_on() -> None:
