@@ -113,8 +113,9 @@ def energy_trace_j(session: Session, run: Run, window_s: tuple[float, float] | N
 def _energy(session: Session, run: Run, energy_j: FloatArray) -> Measures:
     """Return the greatest rise of V above its least value before, and what a tick may add to it.
 
-    Over a tick h the held force f does at most ½h²fᵀM⁻¹f = ½h²q̈ᵀMq̈ that the continuous law
-    would not: the local error of a first-order integrator. The largest of the run is the tolerance.
+    A first-order integrator's local error is of order h²: over a tick the held torque does
+    ½h²q̈ᵀMq̈ that the tick's first power would not (docs/theory.md, 8.3). The tolerance is that at
+    the run's greatest acceleration.
     """
     if not len(energy_j):
         return {}

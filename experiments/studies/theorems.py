@@ -104,9 +104,9 @@ def _section(outcomes: Outcomes, folder: Path) -> Section:
         "Theorems 1 and 2",
         "Arms of two and three joints, 0.57 m apart, with a sub-task that climbs the "
         "manipulability, under a coupling of 50 N/m certified by Theorem B (docs/theory.md) for "
-        "0.6 s of round trip. V is the corrected functional. Sampled at h, it may rise in a tick "
-        "by ½h²q̈ᵀMq̈, the local error of a first-order integrator (docs/theory.md, 8.3): the "
-        "largest of each run is its tolerance.",
+        "0.6 s of round trip. V is the corrected functional. Sampled at h, it may rise by "
+        "terms of order h² a tick (docs/theory.md, 8.3); the tolerance is their size for an "
+        "integrator of first order, ½h²q̈ᵀMq̈ at the run's greatest acceleration.",
         (
             Claim(
                 "Theorem 1",
