@@ -24,9 +24,10 @@ SETTLED_M = 1e-3
 FloatArray = npt.NDArray[np.float64]
 _OF_VECTOR = re.compile(r"_([xyz]|\d+)$")
 _SETTLED_FOR_S = 1.0
-_PACKAGES = (
-    *("channel", "control_law", "experiments", "hardware", "local_site", "remote_site"),
-    *("site_runtime", "telemetry"),
+# What `run_case` goes through; a study's words and pictures leave its runs as they are.
+_SOURCES = (
+    *("channel", "control_law", "hardware", "local_site", "remote_site", "site_runtime"),
+    *("telemetry", "experiments/case.py", "experiments/measures.py", "experiments/simulation.py"),
 )
 
 
@@ -35,8 +36,8 @@ class Case:
     """A session file, relative to experiments/, the keys changed in it, and how long it runs.
 
     `name` names the case in its study. With `until_settled` the run ends once the sites have been
-    within a millimetre of each other for a second; with `energy` the Lyapunov–Krasovskii
-    functional is evaluated at every tick, over windows of `energy_window_s` (d̄_l, d̄_r).
+    within a millimetre of each other for a second; with `energy_window_s` (d̄_l, d̄_r) the
+    Lyapunov–Krasovskii functional is evaluated at every tick, over these windows.
     """
 
     name: str
@@ -149,7 +150,8 @@ def _settled(simulation: Simulation) -> Callable[[Run], bool]:
 def _source_digest() -> str:
     """Digest of the code that a run goes through."""
     digest = hashlib.blake2b(digest_size=16)
-    for package in _PACKAGES:
-        for file in sorted((EXPERIMENTS.parent / package).rglob("*.py")):
+    for source in _SOURCES:
+        path = EXPERIMENTS.parent / source
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else (path,):
             digest.update(file.read_bytes())
     return digest.hexdigest()
