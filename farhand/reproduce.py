@@ -32,7 +32,9 @@ def reproduce(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler", help="Address of a dask scheduler, e.g. tcp://A.example:8786, to run on."
+            "--scheduler",
+            help="Address of a dask scheduler to run on, e.g. tcp://A.example:8786; it and its "
+            "workers have this same farhand installed.",
         ),
     ] = None,
 ) -> None:

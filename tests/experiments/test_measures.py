@@ -90,8 +90,8 @@ def test_an_error_known_again_may_settle() -> None:
 
 def test_errors_by_hand() -> None:
     run = made_up(2001)
-    # 3-4-5 triangles: 0.5 m, from 1 s on 5 mm, from 1.8 s on 0.5 mm
-    apart = np.select([np.arange(2001) < 1000, np.arange(2001) < 1800], [0.1, 0.001], 0.0001)
+    # 3-4-5 triangles: 0.5, 0.25 and 0.4 m, from 1.3 s on 5 mm, from 1.8 s on 0.5 mm
+    apart = np.repeat([0.1, 0.05, 0.08, 0.001, 0.0001], [500, 500, 300, 500, 201])
     run.local["position_m"] = np.stack([1.0 + 3.0 * apart, 2.0 + 4.0 * apart], axis=1)
     run.remote["position_m"] = (1.0, 2.0)
     found = figures(run)
@@ -99,9 +99,9 @@ def test_errors_by_hand() -> None:
     assert found["error_start_m"] == found["error_max_m"] == pytest.approx(0.5)
     # Of the last 500 ticks, 299 were before 1.8 s.
     assert found["error_end_m"] == pytest.approx((299 * 5e-3 + 201 * 5e-4) / 500)
-    assert found["error_second_quarter_m"] == pytest.approx(0.5)
+    assert found["error_second_quarter_m"] == pytest.approx(0.25)
     assert found["error_last_quarter_m"] == pytest.approx(5e-3)
-    assert found["settled_1_cm_s"] == pytest.approx(1.0)
+    assert found["settled_1_cm_s"] == pytest.approx(1.3)
     assert found["settled_1_mm_s"] == pytest.approx(1.8)
     assert (found["local_position_end_x_m"], found["local_position_end_y_m"]) == pytest.approx(
         (1.0003, 2.0004)

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from multiprocessing import active_children
 from pathlib import Path
@@ -311,6 +311,22 @@ def test_interrupted_it_ends_its_processes_without_waiting_for_them(tmp_path: Pa
     assert set(active_children()) <= others
 
 
+def test_ctrl_c_is_left_to_the_parent(tmp_path: Path, expected: dict[str, bytes]) -> None:
+    others = set(active_children())
+
+    def interrupt_workers(_: Case) -> None:
+        for worker in set(active_children()) - others:
+            os.kill(worker.pid, signal.SIGINT)
+
+    longer = replace(FIRST, name="longer", duration_s=2.0)
+    try:
+        run_cases([longer, FIRST], tmp_path, workers=2, done=interrupt_workers)
+    except KeyboardInterrupt:
+        pytest.fail("a worker took it")
+    assert kept(tmp_path)["first"] == expected["first"]
+    assert set(kept(tmp_path)) == {"first", "longer"}
+
+
 def test_interrupted_it_does_not_wait_for_a_cluster(cluster: LocalCluster, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run_cases([ENDLESS, FIRST], tmp_path, scheduler=cluster.scheduler_address, done=interrupt)
@@ -387,7 +403,7 @@ def test_the_command_stopped_half_way_goes_on_from_there(
         # It ends when nobody holds the pipes any more: the workers have gone, too.
         output, errors = started.communicate(timeout=60)
     finally:
-        if started.poll() is None:
+        with suppress(ProcessLookupError):
             os.killpg(started.pid, signal.SIGKILL)
     assert started.returncode == code, errors
     assert "Traceback" not in output + errors
