@@ -29,8 +29,11 @@ _NULL_SPACE = (
 
 
 def settling_time_s(time_s: FloatArray, error_m: FloatArray, limit_m: float) -> float | None:
-    """Return when the error last came below the limit for good [s]; None if it never did."""
-    above = np.flatnonzero(error_m > limit_m)
+    """Return when the error last came below the limit for good [s]; None if it never did.
+
+    An unknown error, NaN, is not below.
+    """
+    above = np.flatnonzero(~(error_m <= limit_m))
     if above.size == 0:
         return float(time_s[0])
     first_below = above[-1] + 1
@@ -119,19 +122,18 @@ def _energy(session: Session, run: Run, energy_j: FloatArray) -> Measures:
     """
     if not len(energy_j):
         return {}
-    held_j = 0.0
+    held_j = np.zeros(len(energy_j) - 1)
     for site, rows in zip(SiteId, (run.local, run.remote), strict=True):
         robot = robot_of(session, site)
-        steps = np.diff(rows["q_dot"], axis=0)
-        tick = int(np.square(steps).sum(axis=1).argmax())
-        M = robot.terms(rows["q"][tick], rows["q_dot"][tick]).M
-        held_j += 0.5 * float(steps[tick] @ M @ steps[tick])
+        for tick, step in enumerate(np.diff(rows["q_dot"], axis=0)):
+            M = robot.terms(rows["q"][tick], rows["q_dot"][tick]).M
+            held_j[tick] += 0.5 * float(step @ M @ step)
     return {
         "energy_start_j": float(energy_j[0]),
         "energy_end_j": float(energy_j[-1]),
         "energy_rise_j": float((energy_j - np.minimum.accumulate(energy_j)).max()),
         "energy_tick_rise_j": float(np.diff(energy_j, prepend=energy_j[0]).max()),
-        "energy_tick_tolerance_j": held_j,
+        "energy_tick_tolerance_j": float(held_j.max(initial=0.0)),
     }
 
 

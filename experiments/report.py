@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from html import escape
 from pathlib import Path
 
 from markdown_it import MarkdownIt
@@ -71,7 +72,7 @@ def write_report(folder: Path, title: str, introduction: str, sections: Sequence
     text = "\n".join(_report(title, introduction, sections))
     (folder / "report.md").write_text(text, encoding="utf-8")
     body = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
-    page = _PAGE.format(title=title, body=body)
+    page = _PAGE.format(title=escape(title), body=body)
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
@@ -105,7 +106,7 @@ def _claims_table(claims: Sequence[Claim]) -> Table:
 
 def _table(table: Table) -> Iterator[str]:
     for row in (table.head, ("---",) * len(table.head), *table.rows):
-        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+        yield "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) + " |"
     yield ""
 
 

@@ -22,6 +22,10 @@ farhand reproduce {names}
 
 with farhand {farhand}, Python {python}, numpy {numpy} and pin {pin}; other versions may differ in
 the last digits. A verdict is computed from the numbers beside it, never typed in."""
+_INVARIANTS = (
+    *("run", "time [s]", "TTE [m]", "T measured / certified [s]", "max ‖Jζ‖ [m/s]"),
+    *("‖STE‖ at the end [rad/s]", "max ‖ΩP‖∞ [N]", "rise of V / V(0)"),
+)
 
 
 def reproduce(
@@ -59,16 +63,7 @@ def _invariants(outcomes: Outcomes) -> Section:
         tables=(
             Table(
                 "",
-                (
-                    "run",
-                    "time [s]",
-                    "TTE [m]",
-                    "T measured / certified [s]",
-                    "max ‖Jζ‖ [m/s]",
-                    "‖STE‖ at the end [rad/s]",
-                    "max ‖ΩP‖∞ [N]",
-                    "rise of V / V(0)",
-                ),
+                _INVARIANTS,
                 tuple(_invariant_row(outcome) for outcome in outcomes.values()),
             ),
         ),
@@ -77,9 +72,11 @@ def _invariants(outcomes: Outcomes) -> Section:
 
 def _invariant_row(outcome: Outcome) -> tuple[str, ...]:
     m = outcome.measures
-    force_n = max(m["local_coupling_force_max_n"], m["remote_coupling_force_max_n"])
-    rise = m["energy_rise_j"] / m["energy_start_j"] if "energy_rise_j" in m else None
     ended = " (failed)" if outcome.failures else ""
+    if not m:  # it failed in its first tick
+        return (f"{outcome.case.name}{ended}", *[""] * (len(_INVARIANTS) - 1))
+    force_n = max(m["local_coupling_force_max_n"], m["remote_coupling_force_max_n"])
+    rise = m["energy_rise_j"] / m["energy_start_j"] if m.get("energy_start_j") else None
     trip = "–" if isnan(m["round_trip_max_s"]) else f"{m['round_trip_max_s']:.3f}"
     return (
         f"{outcome.case.name}{ended}",

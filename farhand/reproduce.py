@@ -11,6 +11,7 @@ from experiments.reproduction import reproduce as reproduce_studies
 from experiments.studies import STUDIES
 from farhand.console import ERR, OUT, user_errors
 
+EXIT_STOPPED = 130  # as a shell says of SIGINT
 _ALL = "all"
 
 
@@ -31,7 +32,9 @@ def reproduce(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler", help="Address of a dask scheduler, e.g. tcp://A.example:8786, to run on."
+            "--scheduler",
+            help="Address of a dask scheduler to run on, e.g. tcp://A.example:8786; it and its "
+            "workers have this same farhand installed.",
         ),
     ] = None,
 ) -> None:
@@ -61,7 +64,11 @@ def reproduce(
             bar.update(task, advance=1, description=case.name)
 
         command = _ALL if _ALL in names else " ".join(study.name for study in studies)
-        reproduce_studies(
-            studies, out, command=command, workers=workers, scheduler=scheduler, done=done
-        )
+        try:
+            reproduce_studies(
+                studies, out, command=command, workers=workers, scheduler=scheduler, done=done
+            )
+        except KeyboardInterrupt:
+            ERR.print("stopped; started again, it goes on with the runs that are missing")
+            raise typer.Exit(EXIT_STOPPED) from None
     OUT.print(f"report: {out / 'report.md'} and {out / 'report.html'}")

@@ -71,7 +71,7 @@ def write_result(
         for name, column in COLUMNS.items():
             if name == "time_ns":
                 continue
-            values = rows[name].reshape(len(rows), -1)
+            values = rows[name] if rows[name].ndim == 2 else rows[name][:, np.newaxis]
             for i, suffix in enumerate(column_names(name, values.shape[1])):
                 array = pa.array(np.ascontiguousarray(values[:, i]))
                 arrays.append(array)

@@ -81,9 +81,11 @@ def test_simulate_tells_of_a_failure_at_time_zero(tmp_path: Path) -> None:
     )
     assert count == 1
     session.write_text(text)
-    result = farhand("simulate", session, "--duration", "1")
+    out = tmp_path / "run.parquet"
+    result = farhand("simulate", session, "--duration", "1", "--out", out)
     assert result.exit_code == 1
     assert "FAULT remote: ZeroDivisionError" in result.output
+    assert read_result(out).time_s.shape == (0,)
 
 
 @pytest.mark.parametrize(

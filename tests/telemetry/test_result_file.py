@@ -64,6 +64,16 @@ def test_equal_runs_give_equal_bytes(tmp_path: Path, sites: Sites) -> None:
     assert (tmp_path / "a.parquet").read_bytes() != (tmp_path / "c.parquet").read_bytes()
 
 
+def test_a_run_without_rows_reads_back_without_rows(tmp_path: Path, sites: Sites) -> None:
+    local, remote = (rows[:0] for rows in sites)
+    write_result(tmp_path / "empty.parquet", local, remote, METADATA)
+    write_result(tmp_path / "run.parquet", *sites, METADATA)
+    empty, full = (read_result(tmp_path / f"{name}.parquet") for name in ("empty", "run"))
+    assert empty.time_s.shape == (0,)
+    assert empty.metadata == METADATA
+    assert list(empty.columns) == list(full.columns)
+
+
 def test_columns_say_their_unit_and_meaning(tmp_path: Path, sites: Sites) -> None:
     write_result(tmp_path / "run.parquet", *sites, METADATA)
     schema = pq.read_schema(tmp_path / "run.parquet")
