@@ -318,7 +318,7 @@ def test_ctrl_c_is_left_to_the_parent(tmp_path: Path, expected: dict[str, bytes]
         for worker in set(active_children()) - others:
             os.kill(worker.pid, signal.SIGINT)
 
-    longer = replace(FIRST, name="longer", duration_s=2.0)
+    longer = replace(FIRST, name="longer", duration_s=1.0)
     try:
         run_cases([longer, FIRST], tmp_path, workers=2, done=interrupt_workers)
     except KeyboardInterrupt:
