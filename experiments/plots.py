@@ -3,17 +3,19 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from experiments.case import Outcome
 from site_runtime.keys import SiteId
 from site_runtime.parts import robot_of
 from site_runtime.session import ObstacleSettings
+
+if TYPE_CHECKING:  # every command passes here, and few draw
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -25,19 +27,21 @@ _MARGIN_M = 0.08
 _DELAYS_SHOWN_S = 20.0
 
 
-def panels(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+def panels(rows: int, columns: int, size_in: tuple[float, float]) -> "tuple[Figure, list[Axes]]":
     """Return a figure and its axes, row by row."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=size_in, layout="constrained")
     return figure, list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
 
 
-def save(figure: Figure, file: Path) -> None:
+def save(figure: "Figure", file: Path) -> None:
     """Write a PNG file; the same figure gives the same bytes."""
     figure.savefig(file, dpi=_DPI, metadata={"Software": None}, pil_kwargs={"optimize": True})
 
 
 def curves(
-    axes: Axes,
+    axes: "Axes",
     time_s: FloatArray,
     columns: Sequence[tuple[str, FloatArray, str]],
     title: str,
@@ -58,7 +62,7 @@ def curves(
         axes.legend(fontsize=8)
 
 
-def stroboscope(axes: Axes, outcome: Outcome, title: str) -> None:
+def stroboscope(axes: "Axes", outcome: Outcome, title: str) -> None:
     """Draw the remote arm in poses evenly spaced along its way, pale to dark, and its obstacles."""
     session = outcome.case.session()
     chains = robot_of(session, SiteId.REMOTE).chain_rows(outcome.vector("remote_q"))
@@ -85,7 +89,9 @@ def stroboscope(axes: Axes, outcome: Outcome, title: str) -> None:
     axes.legend(fontsize=7)
 
 
-def _circles(axes: Axes, obstacle: ObstacleSettings) -> None:
+def _circles(axes: "Axes", obstacle: ObstacleSettings) -> None:
+    from matplotlib.patches import Circle
+
     x_m, y_m, *_ = obstacle.center_m
     for radius_m in (obstacle.collision_radius_m, obstacle.safe_radius_m):
         axes.add_patch(Circle((x_m, y_m), radius_m, fill=False, linestyle="--", color="#3b5bdb"))

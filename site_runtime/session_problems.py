@@ -9,12 +9,20 @@ import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-ABSENT = object()
+
+class _Absent(Enum):
+    """A value that is not there; one member, the same in every process."""
+
+    ABSENT = "absent"
+
+
+ABSENT = _Absent.ABSENT
 """Stands for the value of a key that the file does not have."""
 
 _UNITS = {
@@ -72,6 +80,10 @@ class SessionFileError(SessionError):
         count = f"{len(problems)} problem" + ("s" if len(problems) != 1 else "")
         listed = "\n".join(f"  {problem}" for problem in self.problems)
         super().__init__(f"{path}: {count}\n{listed}")
+
+    def __reduce__(self) -> tuple[type, tuple[str, tuple[Problem, ...]]]:
+        """Pickle by what it was made of, so that it comes back from a worker's process."""
+        return type(self), (self.path, self.problems)
 
 
 def keys_of(table: type) -> dict[str, Any]:

@@ -36,8 +36,8 @@ def draw_synchronisation(avoiding: Outcome) -> Draw:
 @pytest.mark.parametrize(
     ("drawing", "width", "height", "rows", "columns"),
     [
-        ("draw_sub_task", 1600, 740, 2, 4),
-        ("draw_synchronisation", 1200, 660, 2, 2),
+        ("draw_sub_task", 1440, 666, 2, 4),
+        ("draw_synchronisation", 1080, 594, 2, 2),
     ],
 )
 def test_a_figure_has_its_size_and_ink_in_every_panel_and_the_same_bytes_twice(
@@ -69,7 +69,7 @@ def test_panels_are_counted_row_by_row(tmp_path: Path) -> None:
     assert axes[0].get_subplotspec().rowspan.start == 0  # type: ignore[union-attr]
     assert axes[3].get_subplotspec().rowspan.start == 1  # type: ignore[union-attr]
     plots.save(figure, tmp_path / "empty.png")
-    assert imread(tmp_path / "empty.png").shape[:2] == (400, 600)
+    assert imread(tmp_path / "empty.png").shape[:2] == (360, 540)
 
 
 def test_curves_are_the_columns_over_time() -> None:

@@ -1,4 +1,5 @@
 import json
+import pickle
 import tomllib
 from dataclasses import FrozenInstanceError
 from math import inf
@@ -538,3 +539,11 @@ def test_a_mutated_file_gives_a_session_or_a_session_file_error(data):
 def test_the_sinusoid_of_the_paper_is_read_exactly():
     session = load_session(EXPERIMENTS / "paper_free.toml")
     assert session.channel.remote_to_local.delay == SinusoidDelay(0.1, 0.1, 1.0, 0.0)
+
+
+def test_an_error_comes_back_whole_from_another_process(tmp_path):
+    with pytest.raises(SessionFileError) as caught:
+        parse_session("format = 2", tmp_path / "session.toml")
+    copy = pickle.loads(pickle.dumps(caught.value))  # noqa: S301  our own bytes
+    assert str(copy) == str(caught.value)
+    assert copy.problems == caught.value.problems
