@@ -118,3 +118,12 @@ class VelocityByDifference(Protocol):
         0 is a difference without a filter.
         """
         ...
+
+
+class DeviceSettings(Protocol):
+    """A driver's own settings, a frozen dataclass of the driver's module."""
+
+    @property
+    def driver(self) -> str:
+        """Name of the driver in the registry."""
+        ...

@@ -7,12 +7,12 @@ A key that may be left out has its default here; `docs/session_file.md` explains
 import json
 from dataclasses import dataclass, field, replace
 from types import GenericAlias
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, PlainValidator, TypeAdapter, ValidationError
 
 from channel.delay import ConstantDelay, Direction
-from hardware.interface import DeviceConfigurationError
+from hardware.interface import DeviceConfigurationError, DeviceSettings
 from hardware.registry import driver, drivers
 from hardware.robot_model import RobotDescription
 from site_runtime.real_time import RealTimeSettings
@@ -129,15 +129,6 @@ class LimitSettings:
     workspace_max_m: tuple[float, ...] | None = None
 
 
-class DeviceSettings(Protocol):
-    """A driver's own settings, a frozen dataclass of the driver's module."""
-
-    @property
-    def driver(self) -> str:
-        """Name of the driver in the registry."""
-        ...
-
-
 def _device(table: object) -> DeviceSettings:
     """Validate [….device] against the settings of the driver that it names."""
     if not isinstance(table, dict):
@@ -157,7 +148,8 @@ def _device(table: object) -> DeviceSettings:
     annotation: Any = GenericAlias(tuple, (entry.settings,))
     try:
         settings: DeviceSettings = TypeAdapter(annotation, config=_STRICT).validate_json(
-            json.dumps([table])
+            json.dumps([table]),
+            context=_device,  # for a device made of others
         )[0]
     except ValidationError as error:
         problems = explain(error, annotation, [table])

@@ -11,6 +11,7 @@ import pytest
 
 from hardware.interface import Device, DeviceError, DeviceState, FloatArray
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
+from hardware.serial_pair import SerialPair
 from hardware.simulated import SimulatedDevice, SimulatedSettings
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -92,11 +93,29 @@ def simulated_with_everything() -> Bench:
     return simulated(model, settings)
 
 
+def serial_pair() -> Bench:
+    """Two simulated arms, each on its own base: the contract asks nothing of their dynamics."""
+    model = build_robot(PlanarArm("planar", (0.21, 0.17), (0.2, 0.15), "rod"), None)
+    near, far = (simulated(model, SimulatedSettings(start)) for start in ((0.3, 1.2), (1.2, 0.3)))
+
+    def tick() -> None:
+        near.tick()
+        far.tick()
+
+    return Bench(
+        device=SerialPair(near.device, far.device, max_skew_s=0.005),
+        tick=tick,
+        motor_torque_nm=lambda: np.concatenate((near.motor_torque_nm(), far.motor_torque_nm())),
+        torque_nm=np.linspace(0.01, 0.02, 4),
+    )
+
+
 FACTORIES: tuple[Callable[[], Bench], ...] = (
     simulated_point_arm,
     simulated_rod_arm_rk4,
     simulated_seven_joints,
     simulated_with_everything,
+    serial_pair,
 )
 
 

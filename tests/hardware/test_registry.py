@@ -50,7 +50,8 @@ def test_installed_packages_may_add_drivers_but_not_replace_one(
     offer: Callable[..., None],
 ) -> None:
     offer(other="hardware.simulated:DRIVER", simulated="nowhere:DRIVER")
-    assert drivers() == ("other", "simulated")
+    assert "other" in drivers()
+    assert drivers().count("simulated") == 1
     assert isinstance(driver("other"), DriverEntry)
     assert driver("simulated").settings is SimulatedSettings
 
