@@ -7,8 +7,9 @@ import numpy as np
 
 from channel.channel import Channel
 from channel.link import Link
-from hardware.interface import ContactForce
-from hardware.registry import DeviceContext, driver
+from hardware.interface import ContactForce, Device
+from hardware.registry import DeviceContext, driver, force_sensor
+from hardware.sensed import SensedDevice
 from site_runtime.certification import certify
 from site_runtime.clock import Clock
 from site_runtime.controller import Controller
@@ -58,9 +59,13 @@ def assemble(
     robot = robot_of(session, identity)
     n, z = robot.joints, robot.task_dimension
     context = DeviceContext(robot, contact, clock.now_ns, start_ns, 2 * session.seed + identity)
+    device: Device = driver(own.device.driver).create(own.device, context)
+    if own.force_sensor is not None:
+        sensor = force_sensor(own.force_sensor.driver).create(own.force_sensor, context)
+        device = SensedDevice(device, sensor, robot)
     return Site(
         identity,
-        device=driver(own.device.driver).create(own.device, context),
+        device=device,
         robot=robot,
         channel=Channel(
             surroundings.link,
