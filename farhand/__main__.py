@@ -6,6 +6,7 @@ from farhand.certify import certify
 from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
+from farhand.devices import device_check, devices
 from farhand.reproduce import reproduce
 from farhand.simulate import simulate
 from local_site.daemon import local
@@ -18,8 +19,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (local, remote, dashboard, demo, simulate, certify, design, reproduce):
+for command in (local, remote, dashboard, demo, simulate, certify, design, reproduce, devices):
     app.command()(command)
+app.command("device-check")(device_check)
 
 
 def main() -> None:

@@ -37,7 +37,8 @@ class DeviceContext:
     """What a site gives a driver besides its settings.
 
     `now_ns` is the site's monotonic clock, `session_start_ns` the reading of it at session time
-    zero. `contact` acts on simulated arms only.
+    zero. `model` is the whole robot, of which a device may be a part. `contact` acts on simulated
+    arms only.
     """
 
     model: "RobotModel"
@@ -52,22 +53,27 @@ class DriverEntry:
     """A driver: the dataclass of its settings, and the factory (settings, context) → Device.
 
     Settings of a device whose velocity is a difference of positions are `VelocityByDifference`.
-    The factory touches no hardware and may raise DeviceConfigurationError.
+    The factory touches no hardware and may raise DeviceConfigurationError. `missing` says what of
+    the vendor's this machine lacks for these settings (None: for the usual ones) and how to get
+    it, or None; it touches no device either.
     """
 
     settings: type[Any]
     create: Callable[[Any, DeviceContext], Device]
+    missing: Callable[[Any | None], str | None] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SensorEntry:
     """A force sensor's driver: the dataclass of its settings, and the factory → ForceSensor.
 
-    The factory touches no hardware and may raise DeviceConfigurationError.
+    The factory touches no hardware and may raise DeviceConfigurationError. `missing` is as in
+    `DriverEntry`.
     """
 
     settings: type[Any]
     create: Callable[[Any, DeviceContext], ForceSensor]
+    missing: Callable[[Any | None], str | None] | None = None
 
 
 _Entry = TypeVar("_Entry", DriverEntry, SensorEntry)
@@ -92,6 +98,11 @@ def force_sensor(name: str) -> SensorEntry:
     """Load a force sensor's driver; raises DeviceConfigurationError as `driver` does."""
     targets = _targets(SENSOR_ENTRY_POINT_GROUP, _BUILT_IN_SENSORS)
     return _load("force sensor", name, targets, SensorEntry)
+
+
+def missing(entry: DriverEntry | SensorEntry, settings: object | None = None) -> str | None:
+    """Return what this machine lacks for a driver, and how to get it; None if nothing is known."""
+    return None if entry.missing is None else entry.missing(settings)
 
 
 def _load(what: str, name: str, targets: dict[str, str], kind: type[_Entry]) -> _Entry:

@@ -23,7 +23,7 @@ from hardware.interface import (
     FloatArray,
     VelocityByDifference,
 )
-from hardware.registry import DeviceContext, DriverEntry, driver
+from hardware.registry import DeviceContext, DriverEntry, driver, missing
 
 LARGEST_SKEW_S = 0.1
 
@@ -162,22 +162,25 @@ class SerialPair:
             raise self._failed(name, error) from error
 
     def stop(self) -> None:
-        """Stop both, the distal one first: it is the lighter, and moves the more."""
-        self._enabled = False
-        for part in reversed(self._parts.values()):
-            with suppress(Exception):  # a part that breaks its promise must not keep the other on
-                part.stop()
+        """Stop both."""
+        self._stop(last="distal")
 
     def close(self) -> None:
         """Stop both, then close both."""
         self.stop()
         self._opened = False
-        for part in reversed(self._parts.values()):
+        for part in self._parts.values():
             with suppress(Exception):
                 part.close()
 
+    def _stop(self, last: str) -> None:
+        self._enabled = False
+        for name in sorted(self._parts, key=lambda name: name == last):
+            with suppress(Exception):  # a part that breaks its promise must not keep the other on
+                self._parts[name].stop()
+
     def _failed(self, name: str, cause: object) -> DeviceError:
-        self.stop()
+        self._stop(last=name)  # it may be long about its stop
         self._fault = f"{name} part: {cause}"
         return DeviceError(self._fault)
 
@@ -203,4 +206,11 @@ def _create(settings: SerialPairSettings, context: DeviceContext) -> SerialPair:
     return SerialPair(proximal, distal, settings.max_skew_s)
 
 
-DRIVER = DriverEntry(settings=SerialPairSettings, create=_create)
+def _missing(settings: SerialPairSettings | None) -> str | None:
+    """Say what the parts lack; without settings, they are told under their own names."""
+    parts = () if settings is None else (settings.proximal, settings.distal)
+    lacks = [missing(driver(part.driver), part) for part in parts]
+    return "; ".join(lack for lack in lacks if lack is not None) or None
+
+
+DRIVER = DriverEntry(settings=SerialPairSettings, create=_create, missing=_missing)
