@@ -26,6 +26,7 @@ ENTRY_POINT_GROUP = "farhand.drivers"
 SENSOR_ENTRY_POINT_GROUP = "farhand.force_sensors"
 
 _BUILT_IN = {
+    "phantom": "hardware.phantom:DRIVER",
     "serial_pair": "hardware.serial_pair:DRIVER",
     "simulated": "hardware.simulated:DRIVER",
 }
