@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 ENTRY_POINT_GROUP = "farhand.drivers"
 
-_BUILT_IN = {"simulated": "hardware.simulated:DRIVER"}
+_BUILT_IN = {
+    "quanser": "hardware.quanser:DRIVER",
+    "simulated": "hardware.simulated:DRIVER",
+}
 
 
 @dataclass(frozen=True, slots=True)
