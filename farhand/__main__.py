@@ -3,6 +3,7 @@
 import typer
 
 from farhand.certify import certify
+from farhand.commission import commission_quanser
 from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
@@ -19,9 +20,20 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (local, remote, dashboard, demo, simulate, certify, design, reproduce, devices):
+for command in (
+    local,
+    remote,
+    dashboard,
+    demo,
+    simulate,
+    certify,
+    design,
+    reproduce,
+    devices,
+    device_check,
+    commission_quanser,
+):
     app.command()(command)
-app.command("device-check")(device_check)
 
 
 def main() -> None:

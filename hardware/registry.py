@@ -27,6 +27,7 @@ SENSOR_ENTRY_POINT_GROUP = "farhand.force_sensors"
 
 _BUILT_IN = {
     "phantom": "hardware.phantom:DRIVER",
+    "quanser": "hardware.quanser:DRIVER",
     "serial_pair": "hardware.serial_pair:DRIVER",
     "simulated": "hardware.simulated:DRIVER",
 }
