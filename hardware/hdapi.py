@@ -159,7 +159,7 @@ def pop_errors(hd: ctypes.CDLL) -> str | None:
     Errors with a force or motor behind them come before any other.
     """
     found = None
-    for _ in range(1000):  # a library that never runs out of errors must not hold up a frame
+    for _ in range(64):  # a library that never runs out of errors must not hold up a frame
         info = hd.hdGetError()
         if info.code == 0:
             break

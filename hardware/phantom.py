@@ -88,6 +88,11 @@ class PhantomDevice:
         self._enabling = 0
         self._enabled_ns: int | None = None
         self._resets = 0
+        self._check = ThirdAngleCheck()
+        self._last_ns = 0
+        self._last_rad: FloatArray | None = None
+        self._velocity_rad_s = np.zeros(2)
+        self._take_third_angle()
 
     @property
     def joints(self) -> int:
@@ -109,9 +114,7 @@ class PhantomDevice:
         )
         self._fault = None
         self._enabling = self._resets = 0
-        self._check = ThirdAngleCheck()
-        if settings.theta3 != "check":
-            self._check.found = settings.theta3
+        self._check = ThirdAngleCheck(None if settings.theta3 == "check" else settings.theta3)
         self._take_third_angle()
         if settings.calibrate_on_open:
             try:
@@ -242,9 +245,8 @@ class PhantomDevice:
 
     def _take_third_angle(self) -> None:
         """Read the angles as found, as absolute before; the velocity starts anew."""
-        found = self._check.found or "absolute"
-        self._arm = Parallelogram(self._settings.joint_offset_rad, found)
-        self._last_rad: FloatArray | None = None
+        self._arm = Parallelogram(self._settings.joint_offset_rad, self._check.found or "absolute")
+        self._last_rad = None
 
     def _difference(self, position_rad: FloatArray, stamp_ns: int) -> None:
         if self._last_rad is None:

@@ -51,8 +51,8 @@ class ThirdAngleCheck:
     known to a few per cent cannot mislead it. The turret has to stand still meanwhile.
     """
 
-    def __init__(self) -> None:
-        self.found: ThirdAngle | None = None
+    def __init__(self, found: ThirdAngle | None = None) -> None:
+        self.found = found
         self._reference: tuple[tuple[float, ...], tuple[float, ...]] | None = None
         self._apart_m = 0.0
 

@@ -6,7 +6,6 @@ does: however the site dies, the kernel closes the other end.
 """
 
 import contextlib
-import ctypes
 import gc
 import json
 import math

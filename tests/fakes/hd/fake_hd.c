@@ -1,8 +1,8 @@
 /* A stand-in for OpenHaptics' libHD.so: the HDAPI's rules, a 1 kHz servo thread, a plant, and faults.
  *
- * What is watched and injected lies in struct block, in the file named by FARHAND_FAKE_HD (mirrored
- * in fake_hd.py), so that it works from another process and outlives this one; without the variable
- * it is private. The plant is three free joints, inertia and damping each, on the absolute angles
+ * What is watched and injected lies in struct block (mirrored in fake_hd.py), in the file that the
+ * device's name is the path of, so that it works from another process and outlives this one; a name
+ * without a leading "/" leaves it private. The plant is three free joints, inertia and damping each, on the absolute angles
  * the motors act on, or, with FARHAND_FAKE_PLANT, the last two joints of that file's robot.
  */
 #define _GNU_SOURCE
@@ -51,7 +51,7 @@ struct block {
     /* set by tests */
     int32_t inject_error, init_error, unplugged, freeze_angles, stall_ms, period_us, warm;
     int32_t theta3_relative, needs_calibration, jump, hang_in_init;
-    double nan_or_value[3];              /* replaces a reported angle wherever `replace` is set */
+    double value[3];              /* replaces a reported angle wherever `replace` is set */
     int32_t replace[3], reserved_1;
     double hand_nm[3], inertia[3], damping[3], max_velocity_rad_s;
     /* watched by tests; angle_rad and zero_rad may be set before the library is loaded */
@@ -103,9 +103,8 @@ static void *map(const char *path, size_t size) {
     return memory;
 }
 
-__attribute__((constructor)) static void load(void) {
-    block = map(getenv("FARHAND_FAKE_HD"), sizeof *block);
-    if (getenv("FARHAND_FAKE_PLANT")) plant = map(getenv("FARHAND_FAKE_PLANT"), 4096);
+static void attach(const char *path) {
+    block = map(path, sizeof *block);
     for (int i = 0; i < 3; i++) {
         if (block->inertia[i] == 0) block->inertia[i] = 2e-3;
         if (block->damping[i] == 0) block->damping[i] = 0.02;
@@ -114,6 +113,11 @@ __attribute__((constructor)) static void load(void) {
     block->open = block->running = block->force_output = 0; /* left so by a process that was killed */
     memset(block->sent_mnm, 0, sizeof block->sent_mnm);
     block->pid = getpid();
+}
+
+__attribute__((constructor)) static void load(void) {
+    attach(NULL);
+    if (getenv("FARHAND_FAKE_PLANT")) plant = map(getenv("FARHAND_FAKE_PLANT"), 4096);
 }
 
 /* ---- errors: one stack for all threads, newest first ---- */
@@ -202,7 +206,7 @@ static void send(const double mnm[3]) {
 static int in_servo(void) { return block->running && pthread_equal(pthread_self(), servo); }
 
 HHD hdInitDevice(HDstring name) {
-    (void)name;
+    if (!block->open && !block->running && name && name[0] == '/') attach(name);
     while (block->hang_in_init) usleep(1000);
     if (block->init_error || block->unplugged) {
         push(block->init_error ? block->init_error : COMM_ERROR);
@@ -417,7 +421,7 @@ static int doubles(HDenum what, double out[6]) {
     if (block->running && !in_servo()) push(INVALID_OPERATION); /* state belongs in callbacks */
     switch (what) {
     case JOINT_ANGLES:
-        for (int i = 0; i < 3; i++) out[i] = block->replace[i] ? block->nan_or_value[i] : reported[i];
+        for (int i = 0; i < 3; i++) out[i] = block->replace[i] ? block->value[i] : reported[i];
         return 3;
     case LAST_JOINT_ANGLES: memcpy(out, last_reported, sizeof last_reported); return 3;
     case GIMBAL_ANGLES: case VELOCITY: memset(out, 0, 3 * sizeof *out); return 3;

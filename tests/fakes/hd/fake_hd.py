@@ -8,12 +8,11 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 SOURCE = Path(__file__).with_name("fake_hd.c")
-BLOCK_VARIABLE = "FARHAND_FAKE_HD"
 LOG = 65536
 
 _I32, _I64, _U64, _F64 = ctypes.c_int32, ctypes.c_int64, ctypes.c_uint64, ctypes.c_double
@@ -38,7 +37,7 @@ class Block(ctypes.Structure):
         *((name, _I32) for name in ("inject_error", "init_error", "unplugged", "freeze_angles")),
         *((name, _I32) for name in ("stall_ms", "period_us", "warm", "theta3_relative")),
         *((name, _I32) for name in ("needs_calibration", "jump", "hang_in_init")),
-        ("nan_or_value", _F64 * 3),
+        ("value", _F64 * 3),
         ("replace", _I32 * 3),
         ("reserved_1", _I32),
         *((name, _F64 * 3) for name in ("hand_nm", "inertia", "damping")),
@@ -68,38 +67,23 @@ def library() -> Path:
         with tempfile.TemporaryDirectory(dir=cache) as scratch:
             built = Path(scratch) / "libHD.so"
             flags = ["-shared", "-fPIC", "-O2", "-Wall", "-Wextra", "-Werror", "-pthread"]
-            subprocess.run(["cc", *flags, str(SOURCE), "-lm", "-o", str(built)], check=True)
+            compiler = shutil.which("cc") or "cc"
+            subprocess.run([compiler, *flags, str(SOURCE), "-lm", "-o", str(built)], check=True)
             built.replace(target)
     return target
 
 
 class FakeHd:
-    """A PHANToM that is not there, shared with the library that a driver loads.
+    """A PHANToM that is not there: give a driver `library` and `device_name`, and use `block`."""
 
-    While it is entered, libraries loaded by this process and its children are watched and led
-    through `block`.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        path.write_bytes(bytes(ctypes.sizeof(Block)))
-        with path.open("r+b") as file:
-            self.block = Block.from_buffer(mmap.mmap(file.fileno(), ctypes.sizeof(Block)))
-        self.library = str(library())
+    def __init__(self) -> None:
+        descriptor = os.memfd_create("farhand-fake-hd")
+        weakref.finalize(self, os.close, descriptor)
+        os.ftruncate(descriptor, ctypes.sizeof(Block))
+        self.block = Block.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(Block)))
         self.block.angle_rad[:] = (0.0, 0.2, 0.3)
-
-    @contextmanager
-    def entered(self) -> Iterator["FakeHd"]:
-        """Lead the libraries loaded inside to this block."""
-        before = os.environ.get(BLOCK_VARIABLE)
-        os.environ[BLOCK_VARIABLE] = str(self.path)
-        try:
-            yield self
-        finally:
-            if before is None:
-                del os.environ[BLOCK_VARIABLE]
-            else:
-                os.environ[BLOCK_VARIABLE] = before
+        self.device_name = f"/proc/{os.getpid()}/fd/{descriptor}"
+        self.library = str(library())
 
     @property
     def sent_nm(self) -> list[float]:
