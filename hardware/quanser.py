@@ -324,7 +324,7 @@ class QuanserDevice:
     def _fail(self, reason: str) -> NoReturn:
         if self._fault is None:
             self._fault = reason
-            self._quiet()
+            self.stop()
         raise DeviceError(
             f"{self._fault}; the device stays off until it is closed and opened again"
         )

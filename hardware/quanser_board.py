@@ -176,6 +176,7 @@ class QuanserBoard:
         self._errors: type[Exception] | tuple[type[Exception], ...] = ()
         self._task: object | None = None
         self._card: Card | None = None
+        self._safe = True  # 0 V and amplifiers off, as far as the board has confirmed it
 
     def open(self) -> None:
         """Connect, and leave outputs at 0 V, amplifiers off, expiration states set."""
@@ -185,7 +186,7 @@ class QuanserBoard:
         card = vendor.HIL()
         with self._saying("cannot be opened"):
             card.open(wiring.board_type, wiring.board_id)
-        self._card, self._clock = card, vendor.Clock.HARDWARE_CLOCK_0
+        self._card, self._clock, self._safe = card, vendor.Clock.HARDWARE_CLOCK_0, False
         tristate = np.full(len(self._enables), vendor.DigitalState.TRISTATE, np.int32)
         quadrature = np.full(n, vendor.EncoderQuadratureMode.X4, np.int32)
         try:
@@ -255,6 +256,7 @@ class QuanserBoard:
         card, n = self._opened(), len(self._analogs)
         with self._saying("cannot switch its amplifiers on"):
             card.write_analog(self._analogs, n, self._zero_volts)
+            self._safe = False
             card.watchdog_start(watchdog_s)
             card.write_digital(self._enables, len(self._enables), self._on)
 
@@ -273,26 +275,32 @@ class QuanserBoard:
     def make_safe(self) -> None:
         """Set the outputs to 0 V, then switch the amplifiers off; never raises."""
         card = self._card
-        if card is not None:
+        if card is None:
+            return
+        done = 0
+        for step in (
+            lambda: card.write_analog(self._analogs, len(self._analogs), self._zero_volts),
+            lambda: card.write_digital(self._enables, len(self._enables), self._off),
+        ):
             with suppress(Exception):
-                card.write_analog(self._analogs, len(self._analogs), self._zero_volts)
-            with suppress(Exception):
-                card.write_digital(self._enables, len(self._enables), self._off)
+                step()
+                done += 1
+        self._safe = done == 2
 
     def disarm(self) -> None:
-        """Stop the watchdog, of a board that is safe; never raises."""
+        """Stop the watchdog, unless it is all that can still make the board safe; never raises."""
         card = self._card
-        if card is not None:
+        if card is not None and self._safe:
             with suppress(Exception):
                 card.watchdog_stop()
 
     def close(self) -> None:
-        """Stop the watchdog and disconnect; never raises, idempotent."""
+        """Disarm and disconnect; never raises, idempotent."""
+        self.disarm()
         card, self._card = self._card, None
         if card is not None:
-            for step in (card.watchdog_stop, card.close):
-                with suppress(Exception):
-                    step()
+            with suppress(Exception):
+                card.close()
 
     @property
     def _name(self) -> str:

@@ -166,14 +166,14 @@ class _Task:
     running: bool = False
     overflowed: bool = False
     waiting: bool = False
-    failed: bool = False
+    reader: threading.Thread | None = None
 
 
 class Board:
     """One board, the amplifiers on it and the plant that they drive.
 
     Everything is brought up to the present whenever anyone looks. `calls` lists what the driver
-    asked for, in order, reads and reloads of the watchdog left out; `bus_s` is what an access takes.
+    asked for, in order, reads and reloads of the watchdog left out. `bus_s`: time of an access.
     """
 
     def __init__(
@@ -261,7 +261,8 @@ class Board:
             self.now_ns.ns += round(seconds * 1e9)
             self._catch_up()
             self.changed.notify_all()
-            assert self.changed.wait_for(self._fetched, timeout=20.0)
+            while not self._fetched():
+                self.changed.wait(0.005)  # again and again: a thread that ends tells nobody
 
     # What a test sees of the bench
 
@@ -373,7 +374,7 @@ class Board:
         return (
             task is None
             or not task.running
-            or task.failed
+            or (task.reader is not None and not task.reader.is_alive())
             or (task.waiting and not task.samples and not task.overflowed and not self._dead)
         )
 
@@ -519,12 +520,11 @@ class HIL:
         board, job = self._opened(), task[0]
         target = _given(counts, np.int32, num_samples * len(job.channels))
         assert num_samples == 1
+        job.reader = threading.current_thread()
         with board.changed:
             while True:
                 board._catch_up()
                 if board._dead or job.overflowed:
-                    job.failed = True
-                    board.changed.notify_all()
                     raise HILError(DISCONNECTED if board._dead else BUFFER_OVERFLOW)
                 if job.samples:
                     target[:] = job.samples.popleft()
