@@ -26,7 +26,7 @@ ENTRY_POINT_GROUP = "farhand.drivers"
 SENSOR_ENTRY_POINT_GROUP = "farhand.force_sensors"
 
 _BUILT_IN = {"simulated": "hardware.simulated:DRIVER"}
-_BUILT_IN_SENSORS: dict[str, str] = {}
+_BUILT_IN_SENSORS = {"jr3": "hardware.jr3:DRIVER"}
 
 
 @dataclass(frozen=True, slots=True)
