@@ -3,14 +3,22 @@
 import os
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hardware.interface import Device, DeviceError, DeviceState, FloatArray
+from hardware.interface import (
+    Device,
+    DeviceError,
+    DeviceState,
+    FloatArray,
+    ForceReading,
+    Mounting,
+)
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
+from hardware.sensed import SensedDevice
 from hardware.simulated import SimulatedDevice, SimulatedSettings
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -92,11 +100,38 @@ def simulated_with_everything() -> Bench:
     return simulated(model, settings)
 
 
+class SteadyLoad:
+    """A force sensor on the end effector that always feels the same."""
+
+    mounting: Mounting = "end_effector"
+    opened = False
+
+    def open(self) -> None:
+        assert not self.opened
+        self.opened = True
+
+    def read(self) -> ForceReading:
+        return ForceReading(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), 1, saturated=False)
+
+    def tare(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self.opened = False
+
+
+def simulated_with_force_sensor() -> Bench:
+    model = build_robot(PlanarArm("planar", (0.38, 0.38), (0.3, 0.3)), None)
+    bench = simulated(model, SimulatedSettings((2.0, 1.5)))
+    return replace(bench, device=SensedDevice(bench.device, SteadyLoad(), model))
+
+
 FACTORIES: tuple[Callable[[], Bench], ...] = (
     simulated_point_arm,
     simulated_rod_arm_rk4,
     simulated_seven_joints,
     simulated_with_everything,
+    simulated_with_force_sensor,
 )
 
 
