@@ -76,11 +76,7 @@ class PhantomDevice:
     of the timing between it and the site zeroes the torque and stays until `close` and `open`.
     """
 
-    def __init__(self, settings: PhantomSettings, joints: int = 2) -> None:
-        if joints != 2:
-            raise DeviceConfigurationError(
-                f'driver "phantom" moves a planar arm of 2 joints, the robot has {joints}'
-            )
+    def __init__(self, settings: PhantomSettings) -> None:
         self._settings = settings
         self._timeout_ns = round(settings.timeout_s * 1e9)
         self._servo: ServoProcess | None = None
@@ -262,7 +258,7 @@ class PhantomDevice:
 
 
 def _create(settings: PhantomSettings, context: DeviceContext) -> PhantomDevice:
-    return PhantomDevice(settings, context.model.joints)
+    return PhantomDevice(settings)
 
 
 DRIVER = DriverEntry(settings=PhantomSettings, create=_create)

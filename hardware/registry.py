@@ -31,7 +31,7 @@ _BUILT_IN = {
     "serial_pair": "hardware.serial_pair:DRIVER",
     "simulated": "hardware.simulated:DRIVER",
 }
-_BUILT_IN_SENSORS: dict[str, str] = {}
+_BUILT_IN_SENSORS = {"jr3": "hardware.jr3:DRIVER"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,15 +4,23 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hardware.interface import Device, DeviceError, DeviceState, FloatArray
+from hardware.interface import (
+    Device,
+    DeviceError,
+    DeviceState,
+    FloatArray,
+    ForceReading,
+    Mounting,
+)
 from hardware.phantom import PhantomDevice, PhantomSettings
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
+from hardware.sensed import SensedDevice
 from hardware.serial_pair import SerialPair
 from hardware.simulated import SimulatedDevice, SimulatedSettings
 from tests.fakes.hd import fake_hd
@@ -101,6 +109,32 @@ def simulated_with_everything() -> Bench:
     return simulated(model, settings)
 
 
+class SteadyLoad:
+    """A force sensor on the end effector that always feels the same."""
+
+    mounting: Mounting = "end_effector"
+    opened = False
+
+    def open(self) -> None:
+        assert not self.opened
+        self.opened = True
+
+    def read(self) -> ForceReading:
+        return ForceReading(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), 1, saturated=False)
+
+    def tare(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self.opened = False
+
+
+def simulated_with_force_sensor() -> Bench:
+    model = build_robot(PlanarArm("planar", (0.38, 0.38), (0.3, 0.3)), None)
+    bench = simulated(model, SimulatedSettings((2.0, 1.5)))
+    return replace(bench, device=SensedDevice(bench.device, SteadyLoad(), model))
+
+
 def serial_pair() -> Bench:
     """Two simulated arms, each on its own base: the contract asks nothing of their dynamics."""
     model = build_robot(PlanarArm("planar", (0.21, 0.17), (0.2, 0.15), "rod"), None)
@@ -158,6 +192,7 @@ SIMULATED: tuple[Callable[[], Bench], ...] = (
     simulated_seven_joints,
     simulated_with_everything,
     serial_pair,
+    simulated_with_force_sensor,
 )
 DRIVERS: tuple[Callable[[], Bench], ...] = (phantom,)
 FACTORIES = (*SIMULATED, *DRIVERS)
