@@ -137,7 +137,7 @@ class Servo:
         self._position = (c_double * 3)()
         self._torque = (c_double * 3)()
         self._outputs = 0
-        self._resets = 0
+        self._resets = self._resetting = 0
         self._calibrated = False
         self._frame_ns = 0
         self._before: tuple[float, float] | None = None
@@ -215,8 +215,7 @@ class Servo:
             return 0.0, 0.0
         if outputs == 0:
             if resets != self._resets:
-                self._reset_encoders()
-                self._resets = resets
+                self._reset_encoders(resets)
             return 0.0, 0.0
         if stamp_ns == 0:  # nothing has been commanded since the outputs came on
             return 0.0, 0.0
@@ -229,10 +228,15 @@ class Servo:
         (thigh, shin), (thigh_limit, shin_limit) = torque_nm, self._limits_mnm
         return _within(1e3 * thigh, thigh_limit), _within(1e3 * shin, shin_limit)
 
-    def _reset_encoders(self) -> None:
-        self._hd.hdUpdateCalibration(HD_CALIBRATION_ENCODER_RESET)
-        self._calibrated = self._hd.hdCheckCalibration() == HD_CALIBRATION_OK
-        self._before = None
+    def _reset_encoders(self, resets: int) -> None:
+        """Reset in one frame and report it in the next, with the angles that follow from it."""
+        if self._resetting == resets:
+            self._resets = resets
+        else:
+            self._hd.hdUpdateCalibration(HD_CALIBRATION_ENCODER_RESET)
+            self._calibrated = self._hd.hdCheckCalibration() == HD_CALIBRATION_OK
+            self._resetting = resets
+            self._before = None
 
     def _disbelief(self, now_ns: int) -> str | None:
         """Say what is wrong with the angles of thigh and shin; the turret's are not used."""

@@ -11,6 +11,7 @@ import json
 import mmap
 import os
 import signal
+import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -51,6 +52,9 @@ _LAYOUT = {
     "torque_nm": (512, "<f8", MOST_JOINTS),
     "torque_stamp_ns": (640, "<i8", MOST_JOINTS),
 }
+_STATE = struct.Struct(f"<qII{2 * MOST_JOINTS + 6}d")
+_STATE_BEGIN = _LAYOUT["stamp_ns"][0]
+_STATE_END = _STATE_BEGIN + _STATE.size
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,14 +136,13 @@ class PlantMemory:
 
     def publish(self, state: PlantState) -> None:
         """Set the state, as the plant does."""
-        fields, n = self._fields, self.joints
-        fields["sequence"][0] += 1
-        fields["stamp_ns"][0] = state.stamp_ns
-        fields["position_rad"][:n] = state.position_rad
-        fields["velocity_rad_s"][:n] = state.velocity_rad_s
-        fields["wrench"][:] = state.wrench
-        fields["flags"][0] |= RUNNING
-        fields["sequence"][0] += 1
+        gap = [0.0] * (MOST_JOINTS - self.joints)
+        numbers = (*state.position_rad, *gap, *state.velocity_rad_s, *gap, *state.wrench)
+        image = _STATE.pack(state.stamp_ns, self.joints, RUNNING, *numbers)
+        sequence = self._fields["sequence"]
+        sequence[0] += 1
+        self._map[_STATE_BEGIN:_STATE_END] = image  # at once: readers wait meanwhile
+        sequence[0] += 1
 
     def end(self) -> None:
         """Say that the plant has ended."""

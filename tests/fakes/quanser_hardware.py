@@ -136,6 +136,7 @@ class SharedPlant:
             angles = struct.unpack_from(f"<{self._joints}d", self._map, 32 + 8 * self._first)
             if before % 2 == 0 and struct.unpack_from("<Q", self._map, 8)[0] == before:
                 return list(angles)
+            time.sleep(1e-4)
         raise RuntimeError("the shared plant is for ever writing")
 
     def push(self, torque_nm: list[float], from_ns: int, to_ns: int) -> None:
