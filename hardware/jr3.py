@@ -5,8 +5,10 @@ force and moment in two frames of one counter, which runs at the sensor's rate. 
 taken anew at every start and lost at every stop, so the zero kept here is the one that counts.
 """
 
+import importlib.util
 import math
 import queue
+import socket
 import struct
 import threading
 import time
@@ -454,8 +456,26 @@ class _SensorRestartedError(Exception):
     """The sensor has booted while it was being started."""
 
 
+_HOW_CAN_COMES_UP = "plug in the adapter; ip link set can0 up type can bitrate 1000000"
+
+
 def _create(settings: Jr3Settings, context: DeviceContext) -> Jr3:
     return Jr3(settings, context.now_ns)
 
 
-DRIVER = SensorEntry(settings=Jr3Settings, create=_create)
+def _missing(settings: Jr3Settings | None) -> str | None:
+    """Say which module or CAN interface is not there; without settings, whether any is."""
+    if importlib.util.find_spec("can") is None:
+        return "python-can is not installed: pip install python-can"
+    if settings is not None and settings.interface != "socketcan":
+        return None  # whether it opens is told when it is opened
+    interfaces = [name for _, name in socket.if_nameindex()]
+    if settings is None:
+        can_interfaces = [name for name in interfaces if "can" in name]
+        return None if can_interfaces else f"no CAN interface ({_HOW_CAN_COMES_UP})"
+    if settings.channel in interfaces:
+        return None
+    return f"there is no CAN interface {settings.channel!r} ({_HOW_CAN_COMES_UP})"
+
+
+DRIVER = SensorEntry(settings=Jr3Settings, create=_create, missing=_missing)

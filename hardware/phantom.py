@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from hardware.hdapi import HdapiError, load_hdapi
 from hardware.interface import (
     DeviceConfigurationError,
     DeviceError,
@@ -19,6 +20,7 @@ from hardware.phantom_servo import FAULT, ServoOptions
 from hardware.registry import DeviceContext, DriverEntry
 
 PEAK_TORQUE_NM = 1.445
+USUAL_LIBRARY = "libHD.so"
 _ACKNOWLEDGE_S = 0.5
 
 CALIBRATION_POSE = (
@@ -38,7 +40,7 @@ class PhantomSettings:
 
     joint_offset_rad: tuple[float, float]
     driver: Literal["phantom"] = "phantom"
-    library: str = "libHD.so"
+    library: str = USUAL_LIBRARY
     device_name: str = "Default PHANToM"
     theta3: Literal["check", "absolute", "relative"] = "check"
     calibrate_on_open: bool = False
@@ -261,4 +263,12 @@ def _create(settings: PhantomSettings, context: DeviceContext) -> PhantomDevice:
     return PhantomDevice(settings)
 
 
-DRIVER = DriverEntry(settings=PhantomSettings, create=_create)
+def _missing(settings: PhantomSettings | None) -> str | None:
+    try:
+        load_hdapi(USUAL_LIBRARY if settings is None else settings.library)
+    except HdapiError as error:
+        return str(error)
+    return None
+
+
+DRIVER = DriverEntry(settings=PhantomSettings, create=_create, missing=_missing)

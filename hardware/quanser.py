@@ -17,7 +17,13 @@ from typing import Literal, NoReturn
 import numpy as np
 
 from hardware.interface import DeviceConfigurationError, DeviceError, DeviceState, FloatArray
-from hardware.quanser_board import OUTPUT_RANGE_V, QuanserBoard, Wiring
+from hardware.quanser_board import (
+    OUTPUT_RANGE_V,
+    USUAL_MODULE,
+    QuanserBoard,
+    Wiring,
+    missing_module,
+)
 from hardware.quanser_current_limit import FADE_S, CurrentLimit
 from hardware.registry import DeviceContext, DriverEntry
 
@@ -42,7 +48,7 @@ class QuanserSettings:
     driver: Literal["quanser"] = "quanser"
     board_type: str
     board_id: str = "0"
-    module: str = "quanser.hardware"
+    module: str = USUAL_MODULE
     encoder_channels: tuple[int, ...]
     analog_channels: tuple[int, ...]
     enable_channels: tuple[int, ...]
@@ -410,4 +416,8 @@ def _create(settings: QuanserSettings, context: DeviceContext) -> QuanserDevice:
     return QuanserDevice(settings, context.now_ns)
 
 
-DRIVER = DriverEntry(settings=QuanserSettings, create=_create)
+def _missing(settings: QuanserSettings | None) -> str | None:
+    return missing_module(USUAL_MODULE if settings is None else settings.module)
+
+
+DRIVER = DriverEntry(settings=QuanserSettings, create=_create, missing=_missing)

@@ -22,6 +22,7 @@ States = npt.NDArray[np.int32]
 Levels = npt.NDArray[np.int8]
 
 OUTPUT_RANGE_V = 10.0
+USUAL_MODULE = "quanser.hardware"
 BUFFER_S = 1.0  # of samples, which the board keeps for a late reader before it reports an overflow
 # The vendor's name for "without end" is not in every version; this is 24 days at 1 kHz.
 SAMPLES_WITHOUT_END = 2**31 - 1
@@ -32,6 +33,18 @@ _ADVICE = {
     -110: "another program has it open; close that first",
     -111: "the computer did not fetch the samples in time",
 }
+
+
+def missing_module(name: str) -> str | None:
+    """Say why the vendor's module cannot be loaded, and how to get it; None if it can be."""
+    try:
+        importlib.import_module(name)
+    except (ImportError, OSError) as error:  # OSError: the shared library behind it
+        return (
+            f"the vendor's Python module {name} cannot be loaded ({error}); it comes with the "
+            f"Quanser SDK or with QUARC, and must be installed for this Python"
+        )
+    return None
 
 
 class Card(Protocol):
@@ -308,14 +321,10 @@ class QuanserBoard:
 
     def _load(self) -> Vendor:
         name = self._wiring.module
-        try:
-            return cast(Vendor, importlib.import_module(name))
-        except (ImportError, OSError) as error:  # OSError: the shared library behind it
-            raise DeviceError(
-                f"{self._name} cannot be opened: the vendor's Python module {name} cannot be "
-                f"loaded ({error}); it comes with the Quanser SDK or with QUARC, and must be "
-                f"installed for this Python"
-            ) from error
+        lack = missing_module(name)
+        if lack is not None:
+            raise DeviceError(f"{self._name} cannot be opened: {lack}")
+        return cast(Vendor, importlib.import_module(name))
 
     def _opened(self) -> Card:
         if self._card is None:
