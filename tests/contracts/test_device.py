@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from hardware.interface import Device, DeviceError, DeviceState, FloatArray
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
 from hardware.simulated import SimulatedDevice, SimulatedSettings
+from tests.fakes.quanser_bench import QuanserBench
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -21,13 +23,19 @@ class Bench:
     """A device nobody has opened, and a view of it from outside.
 
     `tick` lets about a millisecond pass; `motor_torque_nm` is what the actuators really receive;
-    `torque_nm` is a small torque that the device accepts.
+    `torque_nm` is a small torque that the device accepts. Where the device has a vendor behind it,
+    `unplug` and `garbage` take it away or make it talk nonsense, and `repair` undoes both. Stamps
+    are on the clock `now_ns`.
     """
 
     device: Device
     tick: Callable[[], None]
     motor_torque_nm: Callable[[], FloatArray]
     torque_nm: FloatArray
+    unplug: Callable[[], None] | None = None
+    garbage: Callable[[], None] | None = None
+    repair: Callable[[], None] | None = None
+    now_ns: Callable[[], int] = time.monotonic_ns
 
 
 class Wall:
@@ -92,12 +100,33 @@ def simulated_with_everything() -> Bench:
     return simulated(model, settings)
 
 
-FACTORIES: tuple[Callable[[], Bench], ...] = (
+def quanser() -> Bench:
+    quanser = QuanserBench()
+
+    def unplug() -> None:
+        quanser.board.unplug()
+        quanser.wait(quanser.settings.watchdog_s)  # only the board itself can end torque now
+
+    return Bench(
+        device=quanser.device,
+        tick=quanser.tick,
+        motor_torque_nm=quanser.torque_nm,
+        torque_nm=np.array([0.02, -0.01]),
+        unplug=unplug,
+        garbage=lambda: quanser.board.jump(0, 100_000),
+        repair=quanser.board.plug,
+        now_ns=quanser.time,
+    )
+
+
+SIMULATED: tuple[Callable[[], Bench], ...] = (
     simulated_point_arm,
     simulated_rod_arm_rk4,
     simulated_seven_joints,
     simulated_with_everything,
 )
+DRIVERS: tuple[Callable[[], Bench], ...] = (quanser,)
+FACTORIES = (*SIMULATED, *DRIVERS)
 
 
 @pytest.fixture(params=FACTORIES, ids=lambda factory: factory.__name__)
@@ -108,6 +137,17 @@ def factory(request: pytest.FixtureRequest) -> Callable[[], Bench]:
 @pytest.fixture
 def bench(factory: Callable[[], Bench]) -> Iterator[Bench]:
     bench = factory()
+    yield bench
+    bench.device.close()
+
+
+@pytest.fixture(params=DRIVERS, ids=lambda factory: factory.__name__)
+def vendors(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """A running device with a vendor behind it."""
+    bench: Bench = request.param()
+    bench.device.open()
+    bench.device.enable()
+    run(bench, 5)
     yield bench
     bench.device.close()
 
@@ -295,3 +335,42 @@ def test_opening_and_closing_leaks_nothing(factory: Callable[[], Bench]) -> None
         one_round()
     assert threading.active_count() == threads
     assert len(os.listdir("/proc/self/fd")) == files
+
+
+@pytest.mark.parametrize("trouble", ["unplug", "garbage"])
+def test_a_fault_zeroes_the_torque_and_stays_until_the_device_is_opened_again(
+    vendors: Bench, trouble: str
+) -> None:
+    assert vendors.repair is not None
+    assert vendors.motor_torque_nm().any()
+    getattr(vendors, trouble)()
+    with pytest.raises(DeviceError) as first:
+        run(vendors, 1000)
+    np.testing.assert_array_equal(vendors.motor_torque_nm(), 0.0)
+    vendors.repair()
+    for _ in range(2):
+        for call in (
+            vendors.device.read,
+            vendors.device.enable,
+            lambda: vendors.device.write(vendors.torque_nm),
+        ):
+            with pytest.raises(DeviceError) as again:
+                call()
+            assert str(again.value) == str(first.value)
+        vendors.tick()
+        np.testing.assert_array_equal(vendors.motor_torque_nm(), 0.0)
+        vendors.device.stop()
+    vendors.device.close()
+    vendors.device.open()
+    vendors.device.enable()
+    np.testing.assert_array_equal(vendors.motor_torque_nm(), 0.0)
+    run(vendors, 5)
+    np.testing.assert_allclose(vendors.motor_torque_nm(), vendors.torque_nm, rtol=1e-3)
+
+
+def test_stamps_tell_when_the_state_was_taken(vendors: Bench) -> None:
+    before_ns = vendors.now_ns()
+    vendors.tick()
+    vendors.tick()
+    stamp_ns = vendors.device.read().stamp_ns
+    assert before_ns < stamp_ns <= vendors.now_ns()

@@ -40,7 +40,7 @@ def test_the_simulated_driver_builds_a_device() -> None:
     device.close()
 
 
-@pytest.mark.parametrize("name", ["simulatd", "Simulated", "phantom?"])
+@pytest.mark.parametrize("name", ["simulatd", "Simulated", "nothing"])
 def test_an_unknown_name_is_answered_with_the_nearest(name: str) -> None:
     with pytest.raises(DeviceConfigurationError, match=r"no driver '.*'; nearest: .*simulated"):
         driver(name)
@@ -50,7 +50,7 @@ def test_installed_packages_may_add_drivers_but_not_replace_one(
     offer: Callable[..., None],
 ) -> None:
     offer(other="hardware.simulated:DRIVER", simulated="nowhere:DRIVER")
-    assert drivers() == ("other", "simulated")
+    assert {"other", "simulated"} < set(drivers())
     assert isinstance(driver("other"), DriverEntry)
     assert driver("simulated").settings is SimulatedSettings
 
