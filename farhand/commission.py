@@ -37,6 +37,7 @@ def commission_quanser(
             say("Ctrl-C ends this at once, amplifiers off; on a terminal, so does Enter.")
             signs = []
             for joint in range(commissioning.joints):
+                commissioning.rest()
                 say(f"[bold]joint {joint + 1}[/bold]: turn it by hand in its positive direction")
                 signs.append(commissioning.encoder_sign(joint))
                 say(f"  its encoder counts {'up' if signs[-1] > 0 else 'down'}; let go")

@@ -290,15 +290,14 @@ class QuanserBoard:
         card = self._card
         if card is None:
             return
-        done = 0
-        for step in (
-            lambda: card.write_analog(self._analogs, len(self._analogs), self._zero_volts),
-            lambda: card.write_digital(self._enables, len(self._enables), self._off),
-        ):
-            with suppress(Exception):
-                step()
-                done += 1
-        self._safe = done == 2
+        at_zero = off = False
+        with suppress(Exception):
+            card.write_analog(self._analogs, len(self._analogs), self._zero_volts)
+            at_zero = True
+        with suppress(Exception):
+            card.write_digital(self._enables, len(self._enables), self._off)
+            off = True
+        self._safe = at_zero and off
 
     def disarm(self) -> None:
         """Stop the watchdog, unless it is all that can still make the board safe; never raises."""

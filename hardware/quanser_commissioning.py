@@ -27,7 +27,8 @@ class Probe:
 
     The current rises to `current_a` within `ramp_s` and stays for as long again; motion of its
     joint by `seen_rad` tells the direction, and motion of any joint by `end_rad` ends everything.
-    A hand has to turn a joint by `hand_rad`, within `hand_timeout_s`.
+    A hand has to turn a joint by `hand_rad`, within `hand_timeout_s`. The arm rests when no encoder
+    has moved by a quarter of `seen_rad` for `rest_s`.
     """
 
     current_a: float = 0.2
@@ -106,10 +107,20 @@ class Commissioning:
         self._board.make_safe()
         self._board.close()
 
+    def rest(self) -> None:
+        """Wait until no encoder has moved for a while; amplifiers are off."""
+        probe = self._probe
+        held_rad, since_s = self._angles(), 0.0
+        for elapsed_s in self._until(probe.rest_timeout_s, "the arm did not come to rest"):
+            angles_rad = self._angles()
+            if np.abs(angles_rad - held_rad).max() > 0.25 * probe.seen_rad:
+                held_rad, since_s = angles_rad, elapsed_s
+            if elapsed_s - since_s >= probe.rest_s:
+                return
+
     def encoder_sign(self, joint: int) -> int:
         """Wait for a hand to turn a joint in its positive direction; amplifiers are off."""
         probe = self._probe
-        self._rest()
         start_rad = self._angles()
         for _ in self._until(probe.hand_timeout_s, f"joint {joint + 1} was not turned"):
             moved_rad = float((self._angles() - start_rad)[joint])
@@ -138,7 +149,7 @@ class Commissioning:
     def _push(self, joint: int, direction: int) -> tuple[FloatArray, float]:
         """Ramp a current up until the joint moves; return the motion (n,) and the current."""
         probe = self._probe
-        self._rest()
+        self.rest()
         volts = [0.0] * self.joints
         self._board.arm(WATCHDOG_S)
         try:
@@ -163,17 +174,6 @@ class Commissioning:
             self._board.make_safe()
             self._board.disarm()
         raise AssertionError("the loop above ends by itself")
-
-    def _rest(self) -> None:
-        """Wait until no encoder has moved for a while; amplifiers are off."""
-        probe = self._probe
-        held_rad, since_s = self._angles(), 0.0
-        for elapsed_s in self._until(probe.rest_timeout_s, "the arm did not come to rest"):
-            angles_rad = self._angles()
-            if np.abs(angles_rad - held_rad).max() > 0.25 * probe.seen_rad:
-                held_rad, since_s = angles_rad, elapsed_s
-            if elapsed_s - since_s >= probe.rest_s:
-                return
 
     def _until(self, timeout_s: float, otherwise: str) -> Iterator[float]:
         """Yield the time passed [s] every millisecond; raises DeviceError when it is up."""

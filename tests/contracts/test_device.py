@@ -25,6 +25,7 @@ from hardware.serial_pair import SerialPair
 from hardware.simulated import SimulatedDevice, SimulatedSettings
 from tests.fakes.hd import fake_hd
 from tests.fakes.hd.fake_hd import FakeHd
+from tests.fakes.quanser_bench import QuanserBench
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -35,7 +36,8 @@ class Bench:
 
     `tick` lets about a millisecond pass; `motor_torque_nm` is what the actuators really receive;
     `torque_nm` is a small torque that the device accepts. Where the device has a vendor behind it,
-    `unplug` and `garbage` take it away or make it talk nonsense, and `repair` undoes both.
+    `unplug` and `garbage` take it away or make it talk nonsense, and `repair` undoes both. Stamps
+    are on the clock `now_ns`.
     """
 
     device: Device
@@ -45,6 +47,7 @@ class Bench:
     unplug: Callable[[], None] | None = None
     garbage: Callable[[], None] | None = None
     repair: Callable[[], None] | None = None
+    now_ns: Callable[[], int] = time.monotonic_ns
 
 
 class Wall:
@@ -186,6 +189,25 @@ def phantom() -> Bench:
     )
 
 
+def quanser() -> Bench:
+    quanser = QuanserBench()
+
+    def unplug() -> None:
+        quanser.board.unplug()
+        quanser.wait(quanser.settings.watchdog_s)  # only the board itself can end torque now
+
+    return Bench(
+        device=quanser.device,
+        tick=quanser.tick,
+        motor_torque_nm=quanser.torque_nm,
+        torque_nm=np.array([0.02, -0.01]),
+        unplug=unplug,
+        garbage=lambda: quanser.board.jump(0, 100_000),
+        repair=quanser.board.plug,
+        now_ns=quanser.time,
+    )
+
+
 SIMULATED: tuple[Callable[[], Bench], ...] = (
     simulated_point_arm,
     simulated_rod_arm_rk4,
@@ -194,7 +216,7 @@ SIMULATED: tuple[Callable[[], Bench], ...] = (
     serial_pair,
     simulated_with_force_sensor,
 )
-DRIVERS: tuple[Callable[[], Bench], ...] = (phantom,)
+DRIVERS: tuple[Callable[[], Bench], ...] = (phantom, quanser)
 FACTORIES = (*SIMULATED, *DRIVERS)
 
 
@@ -445,8 +467,8 @@ def test_a_fault_zeroes_the_torque_and_stays_until_the_device_is_opened_again(
 
 
 def test_stamps_tell_when_the_state_was_taken(vendors: Bench) -> None:
-    before_ns = time.monotonic_ns()
+    before_ns = vendors.now_ns()
     vendors.tick()
     vendors.tick()
     stamp_ns = vendors.device.read().stamp_ns
-    assert before_ns < stamp_ns <= time.monotonic_ns()
+    assert before_ns < stamp_ns <= vendors.now_ns()

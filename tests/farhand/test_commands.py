@@ -27,7 +27,18 @@ def farhand(*arguments: str | float | Path) -> Result:
 
 @pytest.mark.parametrize(
     "command",
-    ["local", "remote", "dashboard", "demo", "simulate", "certify", "design", "reproduce", None],
+    [
+        "local",
+        "remote",
+        "dashboard",
+        "demo",
+        "simulate",
+        "certify",
+        "design",
+        "reproduce",
+        "commission-quanser",
+        None,
+    ],
 )
 def test_every_command_offers_help(command: str | None) -> None:
     result = farhand(*([command] if command else []), "--help")

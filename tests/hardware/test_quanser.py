@@ -1,10 +1,12 @@
 """The driver "quanser" against a fake board: units, order of calls, limits, and every fault."""
 
 import itertools
+import mmap
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -444,7 +446,7 @@ def test_a_missing_module_is_explained() -> None:
 
 
 def test_a_missing_shared_library_is_explained(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "vendor_without_library.py").write_text("raise OSError('libhil.so: not found')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -593,3 +595,41 @@ def test_a_motor_that_is_too_hot_by_a_stall_gets_less_than_it_bears() -> None:
 def test_settings_that_cannot_work_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(DeviceConfigurationError, match=message):
         settings_of(fake.Robot(), **changes)
+
+
+# The plant that the fakes share
+
+
+def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "plant"
+    path.write_bytes(bytes(4096))
+    with open(path, "r+b") as file, mmap.mmap(file.fileno(), 4096) as plant:
+        angles = np.frombuffer(plant, np.float64, 16, 32)
+        torques = np.frombuffer(plant, np.float64, 16, 512)
+        stamps = np.frombuffer(plant, np.int64, 16, 640)
+        plant[32 : 32 + 32] = np.array([9.0, 0.5, -0.25, 9.0]).tobytes()
+        monkeypatch.setenv("FARHAND_FAKE_PLANT", str(path))
+        monkeypatch.setenv("FARHAND_FAKE_QUANSER_FIRST", "1")
+        settings = settings_of(fake.Robot(), zero_at_open=False, watchdog_s=0.1)
+        device = QuanserDevice(settings, time.monotonic_ns)
+        device.open()
+        try:
+            state = device.read()
+            np.testing.assert_allclose(
+                state.position_rad, (0.4 + 0.5, -0.7 - 0.5 - 0.25), rtol=0, atol=1e-3
+            )
+            device.enable()
+            device.write(TORQUE)
+            pushed = torques.copy()
+        finally:
+            device.close()
+        np.testing.assert_allclose(
+            pushed[:4], [0.0, *np.array([[1.0, -1.0], [0.0, 1.0]]) @ TORQUE, 0.0], atol=1e-12
+        )
+        assert not torques.any()
+        assert (stamps[1:3] > 0).all()
+        assert not stamps[3:].any()
+        assert angles[1] == 0.5
+        del angles, torques, stamps  # views into the map, which cannot be closed under them
