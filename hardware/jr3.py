@@ -99,7 +99,7 @@ class Jr3Settings:
     bitrate: int = 1_000_000
     cutoff_hz: float = 100.0
     period_s: float = 0.001
-    stale_after_s: float = 0.02
+    stale_after_s: float = 0.05
     tare_samples: int = 200
 
     def __post_init__(self) -> None:
