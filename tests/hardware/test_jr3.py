@@ -550,7 +550,7 @@ def test_garbage_is_a_fault(wire: Wire, opcode: int, data: bytes, words: str) ->
     "frame",
     [
         can.Message(arbitration_id=0x602, is_extended_id=False, data=b"x"),  # another node
-        can.Message(arbitration_id=0x601, is_extended_id=True, data=b"x"),
+        can.Message(arbitration_id=0x101, is_extended_id=True, data=b"xx"),
         can.Message(arbitration_id=0x601, is_extended_id=False, is_remote_frame=True),
         can.Message(arbitration_id=0x080, is_extended_id=False),  # SYNC
         can.Message(arbitration_id=0x101, is_extended_id=False, data=b"\x00"),  # nobody has asked
