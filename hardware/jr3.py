@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,7 @@ FULL_SCALE = 16384
 SATURATED = round(0.98 * FULL_SCALE)
 """Raw value from which an axis counts as saturated; no frame carries a flag."""
 
+_SAMPLE_S = 128.5e-6  # the sensor's period, and so the counter's
 _SETTLE_S = 0.1  # after a start, besides the filter's five time constants
 _WAKE_S = 0.05  # of the reader, to see that it is to end
 _RESTARTS = 3  # while opening; beyond, the sensor has a loose contact
@@ -80,6 +81,11 @@ _ERROR_CLASSES = {
 _RESTARTED = b""  # in the inbox, between acknowledgements
 
 
+class _Sample(NamedTuple):
+    counter: int
+    raw: tuple[int, ...]  # forces, moments
+
+
 @dataclass(frozen=True, slots=True)
 class Jr3Settings:
     """Settings of the sensor "jr3".
@@ -101,7 +107,7 @@ class Jr3Settings:
     bitrate: int = 1_000_000
     cutoff_hz: float = 100.0
     period_s: float = 0.001
-    stale_after_s: float = 0.02
+    stale_after_s: float = 0.05
     tare_samples: int = 200
 
     def __post_init__(self) -> None:
@@ -141,7 +147,7 @@ class Jr3:
         self._stale_ns = round(settings.stale_after_s * 1e9)
         self._bus: can.BusABC | None = None
         self._reader: threading.Thread | None = None
-        self._inbox: queue.SimpleQueue[bytes | tuple[int, ...] | None] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[bytes | _Sample | None] = queue.SimpleQueue()
         self._reset()
 
     @property
@@ -278,6 +284,7 @@ class Jr3:
         self._known = True
         # A process that died may have left it sending, by another counter.
         self._request(Opcode.STOP)
+        self._counter = None
         period_us = round(settings.period_s * 1e6)
         start = _START.pack(round(settings.cutoff_hz * 100.0), period_us)
         self._request(Opcode.START_ASYNC, start)
@@ -286,16 +293,15 @@ class Jr3:
         # or doubled answer to the first question from being taken for one to the second.
         self._request(Opcode.GET_STATE)
         moments_dnm = self._full_scales(Opcode.GET_MOMENT_SCALES)
-        self._wait(_SETTLE_S + 5.0 / (2.0 * math.pi * settings.cutoff_hz))
+        self._settle(_SETTLE_S + 5.0 / (2.0 * math.pi * settings.cutoff_hz))
         full_scale = np.array([*forces_n, *(0.1 * moment for moment in moments_dnm)])
         rotation = np.kron(np.eye(2), np.array(settings.rotation))
-        self._counter = None  # frames from before the start have passed by now
         self._scale = rotation * (full_scale / FULL_SCALE), np.zeros(6)
 
     def _tare(self) -> None:
         while self._take(0.0) is not None:  # what came before does not count
             pass
-        raw = np.array([self._sample() for _ in range(self._settings.tare_samples)])
+        raw = np.array([self._sample().raw for _ in range(self._settings.tare_samples)])
         if (np.abs(raw) >= SATURATED).any():
             raise DeviceError(
                 f"{self._name} is saturated (raw {np.abs(raw).max()} of {FULL_SCALE}) while its "
@@ -332,21 +338,22 @@ class Jr3:
             "with START_ASYNC = 0x200, is known to answer)"
         )
 
-    def _wait(self, seconds: float) -> None:
-        deadline_s = time.monotonic() + seconds
-        while self._take(deadline_s - time.monotonic()) is not None:
+    def _settle(self, seconds: float) -> None:
+        """Let so much time pass for the sensor: frames may be read long after they were sent."""
+        first = self._sample().counter
+        while ((self._sample().counter - first) & 0xFFFF) * _SAMPLE_S < seconds:
             pass
 
-    def _sample(self) -> tuple[int, ...]:
-        """Wait for the next pair of frames and return its raw values (6,)."""
+    def _sample(self) -> _Sample:
+        """Wait for the next pair of frames."""
         deadline_s = time.monotonic() + self._settings.stale_after_s
         while (item := self._take(deadline_s - time.monotonic())) is not None:
-            if isinstance(item, tuple):
+            if isinstance(item, _Sample):
                 return item
         self._fail(self._why_stale())
         raise self._error()
 
-    def _take(self, timeout_s: float) -> bytes | tuple[int, ...] | None:
+    def _take(self, timeout_s: float) -> bytes | _Sample | None:
         """Take what the reader has passed on; None when nothing comes in time."""
         if self._fault is not None:
             raise self._error()
@@ -441,15 +448,14 @@ class Jr3:
         if self._counter is not None and not 0 < (counter - self._counter) & 0xFFFF < 0x8000:
             return
         self._counter = counter
-        if self._scale is None:
-            return
-        per_raw, zero = self._scale
-        wrench = per_raw @ (np.array(raw) - zero)
-        wrench.flags.writeable = False  # every reader of this reading gets the same array
-        saturated = max(raw) >= SATURATED or min(raw) <= -SATURATED
-        self._reading = ForceReading(wrench, stamp_ns, saturated)
+        if self._scale is not None:
+            per_raw, zero = self._scale
+            wrench = per_raw @ (np.array(raw) - zero)
+            wrench.flags.writeable = False  # every reader of this reading gets the same array
+            saturated = max(raw) >= SATURATED or min(raw) <= -SATURATED
+            self._reading = ForceReading(wrench, stamp_ns, saturated)
         if self._attended:
-            self._inbox.put(raw)
+            self._inbox.put(_Sample(counter, raw))
 
 
 class _SensorRestartedError(Exception):
