@@ -1,10 +1,13 @@
 """`farhand devices` and `farhand device-check`."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -86,7 +89,7 @@ def _drivers_of(session: Session) -> Iterator[tuple[str, str, str | None]]:
 
 def device_check(
     session: SessionPath,
-    site: Annotated[str, typer.Option("--site", help="local or remote.")],
+    site: Annotated[Literal["local", "remote"], typer.Option("--site", help="Which site's robot.")],
     seconds: Annotated[
         float, typer.Option("--seconds", help="How long to read, torque off [s].", min=0.1)
     ] = 5.0,
@@ -101,14 +104,21 @@ def device_check(
         float, typer.Option("--motion", help="Travel that ends a push [rad].", min=0.005, max=0.5)
     ] = 0.05,
     yes: Annotated[bool, typer.Option("--yes", help="Push without asking, for scripts.")] = False,
+    fake: Annotated[
+        bool, typer.Option("--fake", help="Among a source tree's fakes in place of hardware.")
+    ] = False,
 ) -> None:
     """Read a site's robot with torque off; with --torque, push each joint a little.
 
     Exit code 1 if a joint answers wrongly, 2 if the device cannot be used.
     """
     with user_errors():
+        if fake:
+            options = ["--site", site, f"--seconds={seconds}", f"--share={share}"]
+            options += [f"--motion={motion}", *["--torque"] * torque, *["--yes"] * yes]
+            raise typer.Exit(_among_fakes(session, site, ["device-check", str(session), *options]))
         loaded = load_session(session)
-        identity = _identity(site)
+        identity = SiteId[site.upper()]
         clock = SteadyClock()
         device = _device(loaded, identity, clock)
         test_torque_nm = _test_torque_nm(loaded, identity, share) if torque else None
@@ -136,11 +146,17 @@ def device_check(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _identity(label: str) -> SiteId:
-    for site in SiteId:
-        if site.label == label:
-            return site
-    raise SessionError(f"--site {label}: must be local or remote")
+def _among_fakes(session: Path, site: str, arguments: list[str]) -> int:
+    """Run a command where fakes stand in for the session's hardware; return its exit code."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / "tests" / "fakes" / "bench.py").is_file():
+        raise SessionError("--fake: the fakes come with farhand's source tree, not with a package")
+    fakes = ["-m", "tests.fakes.bench", str(session), "--site", site, "--"]
+    command = [sys.executable, *fakes, sys.executable, "-m", "farhand", *arguments]
+    paths = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
+    return subprocess.run(  # noqa: S603  our own modules
+        command, env=os.environ | {"PYTHONPATH": paths}, check=False
+    ).returncode
 
 
 def _device(session: Session, identity: SiteId, clock: SteadyClock) -> Device:

@@ -7,6 +7,7 @@ taken anew at every start and lost at every stop, so the zero kept here is the o
 
 import importlib.util
 import math
+import os
 import queue
 import socket
 import struct
@@ -162,7 +163,10 @@ class Jr3:
         self._reset()
         self._bus = self._open_bus()
         self._reader = threading.Thread(
-            target=self._receive, args=(self._bus,), name="jr3", daemon=True
+            target=self._receive,
+            args=(self._bus, os.sched_getscheduler(0), os.sched_getparam(0)),
+            name="jr3",
+            daemon=True,
         )
         try:
             self._reader.start()
@@ -388,7 +392,11 @@ class Jr3:
 
     # The reader's side.
 
-    def _receive(self, bus: "can.BusABC") -> None:
+    def _receive(self, bus: "can.BusABC", scheduler: int, priority: os.sched_param) -> None:
+        # A site's real-time class is not inherited by its threads, and one that is put aside while
+        # it holds the interpreter's lock keeps the site waiting.
+        with suppress(OSError):
+            os.sched_setscheduler(0, scheduler, priority)
         try:
             while not self._closing:
                 message = bus.recv(_WAKE_S)
