@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,7 +85,10 @@ def bench(session: Session) -> Outcome:
         missed = max(rows["missed"][-1] / len(rows) for rows in found.rows.values())
         if missed < CARRIED:
             return found
-    pytest.skip(f"this machine misses {missed:.1%} of the ticks: too busy for a dozen processes")
+    pytest.skip(
+        f"this machine misses {missed:.1%} of the ticks: it is too busy for a dozen processes\n"
+        + found.printed
+    )
 
 
 def outcome(run: Run, printed: str) -> Outcome:
@@ -112,18 +115,19 @@ def run_bench(session: Session) -> tuple[Run, str]:
             options = ["--quiet", "--duration", f"{HAND_S + 2.0}", "--listen", endpoints[site]]
             if site is SiteId.LOCAL:
                 options += ["--connect", endpoints[SiteId.REMOTE]]
-            daemons.append(
-                stack.enter_context(
-                    subprocess.Popen(
-                        [sys.executable, "-m", f"{site.label}_site", str(BENCH), *options],
-                        cwd=ROOT,
-                        env=os.environ | environments[site],
-                        stdout=subprocess.PIPE,
-                        stderr=subprocess.STDOUT,
-                        text=True,
-                    )
+            daemon = stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", f"{site.label}_site", str(BENCH), *options],
+                    cwd=ROOT,
+                    env=os.environ | environments[site],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
                 )
             )
+            with suppress(OSError):  # the network's threads, which ask for no real time
+                os.setpriority(os.PRIO_PROCESS, daemon.pid, -15)
+            daemons.append(daemon)
         while any(daemon.poll() is None for daemon in daemons):
             for batch, _ in feed.receive():
                 rows[SiteId(batch.site)].append(batch.rows)
