@@ -303,8 +303,7 @@ class Jr3:
         self._scale = rotation * (full_scale / FULL_SCALE), np.zeros(6)
 
     def _tare(self) -> None:
-        while self._take(0.0) is not None:  # what came before does not count
-            pass
+        self._forget()
         raw = np.array([self._sample().raw for _ in range(self._settings.tare_samples)])
         if (np.abs(raw) >= SATURATED).any():
             raise DeviceError(
@@ -313,7 +312,9 @@ class Jr3:
             )
         assert self._scale is not None  # noqa: S101  _start has set it
         self._scale = self._scale[0], raw.mean(axis=0)
-        self._sample()  # one reading with the new zero
+        self._forget()
+        self._sample()  # may have been under way when the zero was set
+        self._sample()
 
     def _full_scales(self, opcode: Opcode) -> tuple[int, ...]:
         scales: tuple[int, ...] = _FULL_SCALES.unpack(self._request(opcode, answer_bytes=7))
@@ -323,8 +324,7 @@ class Jr3:
 
     def _request(self, opcode: Opcode, payload: bytes = b"", answer_bytes: int = 1) -> bytes:
         """Send a request; return its acknowledgement's payload after the state byte."""
-        while self._take(0.0) is not None:
-            pass
+        self._forget()
         self._send(opcode, payload)
         deadline_s = time.monotonic() + ACKNOWLEDGE_S
         while (answer := self._take(deadline_s - time.monotonic())) is not None:
@@ -356,6 +356,11 @@ class Jr3:
                 return item
         self._fail(self._why_stale())
         raise self._error()
+
+    def _forget(self) -> None:
+        """Pass over what the reader has passed on."""
+        while self._take(0.0) is not None:
+            pass
 
     def _take(self, timeout_s: float) -> bytes | _Sample | None:
         """Take what the reader has passed on; None when nothing comes in time."""

@@ -230,7 +230,7 @@ def test_tare_makes_the_present_load_the_zero(opened: Bench) -> None:
     opened.load = LOAD
     eventually(lambda: settled(opened, LOAD))
     opened.sensor.tare()
-    eventually(lambda: settled(opened, np.zeros(6)))
+    assert settled(opened, np.zeros(6))
     opened.load = 2.0 * LOAD
     eventually(lambda: settled(opened, LOAD))
 

@@ -80,9 +80,9 @@ class Jr3Node:
     """The board, on a thread of its own from `start` to `stop`.
 
     Faults are attributes, to be set at any time: `frozen` (the sensor has stopped, the board sends
-    on), `mute` (nothing is sent), `lose_acks` (so many are lost), `ack_delay_s`, `double_acks`,
-    `mangle` (what becomes of each pair of frames), `sensor` False from the start (none plugged
-    in). `requests` lists what was asked.
+    on), `mute` (nothing is sent), `lose_acks` (so many are lost), `ack_delay_s`, `double_acks`
+    (each comes again just before the next), `mangle` (what becomes of each pair of frames),
+    `sensor` False from the start (none plugged in). `requests` lists what was asked.
     """
 
     def __init__(
@@ -113,6 +113,7 @@ class Jr3Node:
         self._lock = threading.RLock()
         self._ending = threading.Event()
         self._deaf = False
+        self._double: can.Message | None = None
         self._late: list[tuple[float, can.Message]] = []
         self._halt()
         self._thread = threading.Thread(target=self._run, name="jr3-node", daemon=True)
@@ -261,7 +262,10 @@ class Jr3Node:
             self.lose_acks -= 1
             return
         due_s = time.monotonic() + self.ack_delay_s
-        self._late += [(due_s, message)] * (1 + self.double_acks)
+        if self._double is not None:
+            self._late.append((due_s, self._double))
+        self._double = message if self.double_acks else None
+        self._late.append((due_s, message))
         self._send_late()
 
     def _send_late(self) -> None:
