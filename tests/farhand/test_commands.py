@@ -1,6 +1,8 @@
 """The command line, as a person meets it."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from site_runtime.certification import certify as certify_session
 from site_runtime.session import load_session
 from site_runtime.session_edit import edited
 from telemetry.result_file import read_result
+from tests.fakes.hd import fake_hd
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 DEMO = EXPERIMENTS / "demo.toml"
@@ -306,3 +309,22 @@ def test_device_check_needs_limits_before_it_pushes(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "remote.limits.torque_nm is missing" in result.output
     assert farhand("device-check", DEMO, "--site", "left").exit_code == 2
+
+
+@pytest.mark.processes
+def test_device_check_finds_fakes_where_there_is_no_hardware() -> None:
+    if reason := fake_hd.missing():
+        pytest.skip(reason)
+    root = EXPERIMENTS.parent
+    command = ["device-check", EXPERIMENTS / "bench_fake.toml", "--site", "local"]
+    done = subprocess.run(
+        [sys.executable, "-m", "farhand", *map(str, command), "--seconds", "0.5", "--fake"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "local device (phantom)" in done.stdout
+    assert "q2 [rad]" in done.stdout
