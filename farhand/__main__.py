@@ -3,9 +3,11 @@
 import typer
 
 from farhand.certify import certify
+from farhand.commission import commission_quanser
 from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
+from farhand.devices import device_check, devices
 from farhand.reproduce import reproduce
 from farhand.simulate import simulate
 from local_site.daemon import local
@@ -18,7 +20,19 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (local, remote, dashboard, demo, simulate, certify, design, reproduce):
+for command in (
+    local,
+    remote,
+    dashboard,
+    demo,
+    simulate,
+    certify,
+    design,
+    reproduce,
+    devices,
+    device_check,
+    commission_quanser,
+):
     app.command()(command)
 
 

@@ -10,7 +10,7 @@ Errors::
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -94,6 +94,53 @@ class Device(Protocol):
         ...
 
 
+Mounting = Literal["base", "end_effector"]
+"""The axes of a force sensor's readings: the robot's base, or the frame of its end effector."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForceReading:
+    """One reading of a force sensor.
+
+    `wrench` (6,) [N, N·m] is what the hand or the environment exerts ON the robot, in the axes
+    that `ForceSensor.mounting` names; the moment is about the sensor's origin. `stamp_ns` is when
+    it arrived, on the site's monotonic clock. A `saturated` wrench is a lower bound, not a value.
+    """
+
+    wrench: FloatArray
+    stamp_ns: int
+    saturated: bool
+
+
+class ForceSensor(Protocol):
+    """A six-axis force sensor: open → (read | tare)* → close; a closed one may be opened again.
+
+    Whatever fails on the sensor's side latches: from then on every call but `close` raises
+    DeviceError with the first cause, until the sensor is closed and opened again.
+    """
+
+    @property
+    def mounting(self) -> Mounting:
+        """The axes of the readings."""
+        ...
+
+    def open(self) -> None:
+        """Connect and tare, with nothing touching the robot; may block; raises DeviceError."""
+        ...
+
+    def read(self) -> ForceReading:
+        """Return the newest reading; never blocks; raises DeviceError, also when it is stale."""
+        ...
+
+    def tare(self) -> None:
+        """Make the present load the zero; may block; raises DeviceError."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; never raises, idempotent."""
+        ...
+
+
 class ContactForce(Protocol):
     """Force of an operator or an environment on the end effector of a simulated device."""
 
@@ -117,4 +164,13 @@ class VelocityByDifference(Protocol):
 
         0 is a difference without a filter.
         """
+        ...
+
+
+class DeviceSettings(Protocol):
+    """A driver's own settings, a frozen dataclass of the driver's module."""
+
+    @property
+    def driver(self) -> str:
+        """Name of the driver in the registry."""
         ...

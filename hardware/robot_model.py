@@ -170,6 +170,17 @@ class RobotModel:
         inverse: FloatArray = pin.computeMinverse(self._model, self._data, q)
         return inverse.reshape(self.joints, self.joints)
 
+    def orientation(self, q: FloatArray) -> FloatArray:
+        """Return R (3, 3) of the end effector's frame: v in base axes = R v in the frame's.
+
+        A planar arm's frame has x along the last link and z along the joint axes.
+        """
+        pin.forwardKinematics(self._model, self._data, q)
+        rotation: FloatArray = pin.updateFramePlacement(
+            self._model, self._data, self._frame
+        ).rotation
+        return rotation.copy()
+
     def chain(self, q: FloatArray) -> FloatArray:
         """Return the joint centres and the end effector (n + 1, 3) [m], for drawing."""
         pin.forwardKinematics(self._model, self._data, q)

@@ -7,15 +7,16 @@ import numpy as np
 
 from channel.channel import Channel
 from channel.link import Link
-from hardware.interface import ContactForce
-from hardware.registry import DeviceContext, driver
+from hardware.interface import ContactForce, Device, DeviceConfigurationError
+from hardware.registry import DeviceContext, driver, force_sensor
+from hardware.sensed import SensedDevice
 from site_runtime.certification import certify
 from site_runtime.clock import Clock
 from site_runtime.controller import Controller
 from site_runtime.guard import Guard
 from site_runtime.keys import SiteId
 from site_runtime.parts import limits_of, robot_of
-from site_runtime.session import Session
+from site_runtime.session import LocalSettings, RemoteSettings, Session
 from site_runtime.site import Site, SiteTimes
 from site_runtime.supervisor import EngagementTimes, Supervisor
 from telemetry.stream import TelemetryStream
@@ -36,6 +37,23 @@ class Surroundings:
     epoch: int
     publish: Callable[[bytes], None]
     shared_clock: bool = False
+
+
+def device_of(settings: LocalSettings | RemoteSettings, context: DeviceContext) -> Device:
+    """Build a site's robot, with its force sensor if it has one.
+
+    Raises DeviceConfigurationError if its driver moves another number of joints.
+    """
+    device = driver(settings.device.driver).create(settings.device, context)
+    if device.joints != context.model.joints:
+        raise DeviceConfigurationError(
+            f"driver {settings.device.driver!r} moves {device.joints} joints, the robot has "
+            f"{context.model.joints}"
+        )
+    if settings.force_sensor is None:
+        return device
+    entry = force_sensor(settings.force_sensor.driver)
+    return SensedDevice(device, entry.create(settings.force_sensor, context), context.model)
 
 
 def assemble(
@@ -60,7 +78,7 @@ def assemble(
     context = DeviceContext(robot, contact, clock.now_ns, start_ns, 2 * session.seed + identity)
     return Site(
         identity,
-        device=driver(own.device.driver).create(own.device, context),
+        device=device_of(own, context),
         robot=robot,
         channel=Channel(
             surroundings.link,

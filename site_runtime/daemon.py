@@ -115,7 +115,7 @@ def run_daemon(
             cpus = session.real_time
             cpu = cpus.local_cpu if identity is SiteId.LOCAL else cpus.remote_cpu
             with (
-                _StopSignals(clock, options.duration_s) as signals,
+                StopSignals(clock, options.duration_s) as signals,
                 StatusLine(site, quiet=options.quiet),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
@@ -144,7 +144,7 @@ def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNo
     )
 
 
-class _StopSignals:
+class StopSignals:
     """Signals and the duration end the loop between two ticks, never inside one."""
 
     def __init__(self, clock: SteadyClock, duration_s: float | None) -> None:
@@ -157,7 +157,7 @@ class _StopSignals:
         """Whether the loop should end."""
         return self._asked or (self._end_ns is not None and self._clock.now_ns() >= self._end_ns)
 
-    def __enter__(self) -> "_StopSignals":
+    def __enter__(self) -> "StopSignals":
         for number in STOP_SIGNALS:
             if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
                 continue  # started under nohup, to outlive its terminal

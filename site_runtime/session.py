@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from channel.delay import TraceDelay
-from hardware.interface import HardwareError
+from hardware.interface import DeviceSettings, HardwareError
 from hardware.robot_model import UrdfArm
 from site_runtime.keys import SiteId
 from site_runtime.real_time import RealTimeSettings
@@ -32,7 +32,6 @@ from site_runtime.session_settings import (
     ConstantOperator,
     CouplingSettings,
     DampingSettings,
-    DeviceSettings,
     EngagementSettings,
     EnvironmentSettings,
     HumanArmOperator,

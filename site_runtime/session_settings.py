@@ -5,15 +5,16 @@ A key that may be left out has its default here; `docs/session_file.md` explains
 """
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import GenericAlias
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, PlainValidator, TypeAdapter, ValidationError
 
 from channel.delay import ConstantDelay, Direction
-from hardware.interface import DeviceConfigurationError
-from hardware.registry import driver, drivers
+from hardware.interface import DeviceConfigurationError, DeviceSettings
+from hardware.registry import DriverEntry, SensorEntry, driver, drivers, force_sensor, force_sensors
 from hardware.robot_model import RobotDescription
 from site_runtime.real_time import RealTimeSettings
 from site_runtime.session_problems import ABSENT, NestedProblems, Problem, explain, nearest
@@ -129,35 +130,37 @@ class LimitSettings:
     workspace_max_m: tuple[float, ...] | None = None
 
 
-class DeviceSettings(Protocol):
-    """A driver's own settings, a frozen dataclass of the driver's module."""
-
-    @property
-    def driver(self) -> str:
-        """Name of the driver in the registry."""
-        ...
-
-
 def _device(table: object) -> DeviceSettings:
-    """Validate [….device] against the settings of the driver that it names."""
+    return _driver_settings(table, drivers(), driver)
+
+
+def _force_sensor(table: object) -> DeviceSettings:
+    return _driver_settings(table, force_sensors(), force_sensor)
+
+
+def _driver_settings(
+    table: object, names: Sequence[str], load: Callable[[str], DriverEntry | SensorEntry]
+) -> DeviceSettings:
+    """Validate a table against the settings of the driver that it names."""
     if not isinstance(table, dict):
         raise NestedProblems([Problem("", table, "must be a table with driver = a driver's name")])
     name = table.get("driver", ABSENT)
     if name is ABSENT:
-        allowed = ", ".join(f'"{known}"' for known in drivers())
+        allowed = ", ".join(f'"{known}"' for known in names)
         raise NestedProblems([Problem(".driver", ABSENT, f"is missing; one of {allowed}")])
     if not isinstance(name, str):
-        raise NestedProblems([Problem(".driver", name, nearest(name, drivers()))])
+        raise NestedProblems([Problem(".driver", name, nearest(name, names))])
     try:
-        entry = driver(name)
+        entry = load(name)
     except DeviceConfigurationError as error:
-        reason = str(error) if name in drivers() else nearest(name, drivers())
+        reason = str(error) if name in names else nearest(name, names)
         raise NestedProblems([Problem(".driver", name, reason)]) from None
     # A tuple, since it may carry the strict configuration to a class that knows no pydantic.
     annotation: Any = GenericAlias(tuple, (entry.settings,))
     try:
         settings: DeviceSettings = TypeAdapter(annotation, config=_STRICT).validate_json(
-            json.dumps([table])
+            json.dumps([table]),
+            context=_device,  # for a device made of others
         )[0]
     except ValidationError as error:
         problems = explain(error, annotation, [table])
@@ -171,6 +174,11 @@ Device = Annotated[
     DeviceSettings,
     PlainValidator(_device),
     Field(description="a table with driver = a driver's name, and that driver's settings"),
+]
+ForceSensor = Annotated[
+    DeviceSettings | None,
+    PlainValidator(_force_sensor),
+    Field(description="a table with driver = a force sensor's driver, and that driver's settings"),
 ]
 
 
@@ -329,6 +337,7 @@ class LocalSettings:
     robot: RobotDescription
     damping: DampingSettings
     device: Device
+    force_sensor: ForceSensor = None
     limits: LimitSettings = LimitSettings()
     operator: OperatorSettings = NoOperator("none")
 
@@ -340,6 +349,7 @@ class RemoteSettings:
     robot: RobotDescription
     damping: DampingSettings
     device: Device
+    force_sensor: ForceSensor = None
     limits: LimitSettings = LimitSettings()
     environment: EnvironmentSettings = EnvironmentSettings()
     obstacles: tuple[ObstacleSettings, ...] = ()

@@ -2,16 +2,30 @@
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hardware.interface import Device, DeviceError, DeviceState, FloatArray
+from hardware.interface import (
+    Device,
+    DeviceError,
+    DeviceState,
+    FloatArray,
+    ForceReading,
+    Mounting,
+)
+from hardware.phantom import PhantomDevice, PhantomSettings
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
+from hardware.sensed import SensedDevice
+from hardware.serial_pair import SerialPair
 from hardware.simulated import SimulatedDevice, SimulatedSettings
+from tests.fakes.hd import fake_hd
+from tests.fakes.hd.fake_hd import FakeHd
+from tests.fakes.quanser_bench import QuanserBench
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -21,13 +35,19 @@ class Bench:
     """A device nobody has opened, and a view of it from outside.
 
     `tick` lets about a millisecond pass; `motor_torque_nm` is what the actuators really receive;
-    `torque_nm` is a small torque that the device accepts.
+    `torque_nm` is a small torque that the device accepts. Where the device has a vendor behind it,
+    `unplug` and `garbage` take it away or make it talk nonsense, and `repair` undoes both. Stamps
+    are on the clock `now_ns`.
     """
 
     device: Device
     tick: Callable[[], None]
     motor_torque_nm: Callable[[], FloatArray]
     torque_nm: FloatArray
+    unplug: Callable[[], None] | None = None
+    garbage: Callable[[], None] | None = None
+    repair: Callable[[], None] | None = None
+    now_ns: Callable[[], int] = time.monotonic_ns
 
 
 class Wall:
@@ -92,22 +112,140 @@ def simulated_with_everything() -> Bench:
     return simulated(model, settings)
 
 
-FACTORIES: tuple[Callable[[], Bench], ...] = (
+class SteadyLoad:
+    """A force sensor on the end effector that always feels the same."""
+
+    mounting: Mounting = "end_effector"
+    opened = False
+
+    def open(self) -> None:
+        assert not self.opened
+        self.opened = True
+
+    def read(self) -> ForceReading:
+        return ForceReading(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]), 1, saturated=False)
+
+    def tare(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self.opened = False
+
+
+def simulated_with_force_sensor() -> Bench:
+    model = build_robot(PlanarArm("planar", (0.38, 0.38), (0.3, 0.3)), None)
+    bench = simulated(model, SimulatedSettings((2.0, 1.5)))
+    return replace(bench, device=SensedDevice(bench.device, SteadyLoad(), model))
+
+
+def serial_pair() -> Bench:
+    """Two simulated arms, each on its own base: the contract asks nothing of their dynamics."""
+    model = build_robot(PlanarArm("planar", (0.21, 0.17), (0.2, 0.15), "rod"), None)
+    near, far = (simulated(model, SimulatedSettings(start)) for start in ((0.3, 1.2), (1.2, 0.3)))
+
+    def tick() -> None:
+        near.tick()
+        far.tick()
+
+    return Bench(
+        device=SerialPair(near.device, far.device, max_skew_s=0.005),
+        tick=tick,
+        motor_torque_nm=lambda: np.concatenate((near.motor_torque_nm(), far.motor_torque_nm())),
+        torque_nm=np.linspace(0.01, 0.02, 4),
+    )
+
+
+def phantom() -> Bench:
+    fake = FakeHd()
+    settings = PhantomSettings(
+        (0.1, -0.2),
+        library=fake.library,
+        device_name=fake.device_name,
+        theta3="absolute",
+        torque_ramp_s=0.0,
+        timeout_s=0.5,
+    )
+
+    def motor_torque_nm() -> FloatArray:
+        fake.frames(2)
+        _, thigh_nm, shin_nm = fake.sent_nm
+        return np.array([thigh_nm + shin_nm, shin_nm])
+
+    def garbage() -> None:
+        fake.block.value[1] = np.nan
+        fake.block.replace[1] = 1
+
+    def repair() -> None:
+        fake.block.unplugged = fake.block.replace[1] = 0
+
+    return Bench(
+        device=PhantomDevice(settings),
+        tick=lambda: fake.frames(2),
+        motor_torque_nm=motor_torque_nm,
+        torque_nm=np.array([0.01, 0.02]),
+        unplug=lambda: setattr(fake.block, "unplugged", 1),
+        garbage=garbage,
+        repair=repair,
+    )
+
+
+def quanser() -> Bench:
+    quanser = QuanserBench()
+
+    def unplug() -> None:
+        quanser.board.unplug()
+        quanser.wait(quanser.settings.watchdog_s)  # only the board itself can end torque now
+
+    return Bench(
+        device=quanser.device,
+        tick=quanser.tick,
+        motor_torque_nm=quanser.torque_nm,
+        torque_nm=np.array([0.02, -0.01]),
+        unplug=unplug,
+        garbage=lambda: quanser.board.jump(0, 100_000),
+        repair=quanser.board.plug,
+        now_ns=quanser.time,
+    )
+
+
+SIMULATED: tuple[Callable[[], Bench], ...] = (
     simulated_point_arm,
     simulated_rod_arm_rk4,
     simulated_seven_joints,
     simulated_with_everything,
+    serial_pair,
+    simulated_with_force_sensor,
 )
+DRIVERS: tuple[Callable[[], Bench], ...] = (phantom, quanser)
+FACTORIES = (*SIMULATED, *DRIVERS)
+
+
+def built(factory: Callable[[], Bench]) -> Callable[[], Bench]:
+    """Skip where the stand-in of a vendor's library cannot be built."""
+    if factory is phantom and (reason := fake_hd.missing()):
+        pytest.skip(reason)
+    return factory
 
 
 @pytest.fixture(params=FACTORIES, ids=lambda factory: factory.__name__)
 def factory(request: pytest.FixtureRequest) -> Callable[[], Bench]:
-    return request.param  # type: ignore[no-any-return]
+    return built(request.param)
 
 
 @pytest.fixture
 def bench(factory: Callable[[], Bench]) -> Iterator[Bench]:
     bench = factory()
+    yield bench
+    bench.device.close()
+
+
+@pytest.fixture(params=DRIVERS, ids=lambda factory: factory.__name__)
+def vendors(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """A running device with a vendor behind it."""
+    bench = built(request.param)()
+    bench.device.open()
+    bench.device.enable()
+    run(bench, 5)
     yield bench
     bench.device.close()
 
@@ -295,3 +433,42 @@ def test_opening_and_closing_leaks_nothing(factory: Callable[[], Bench]) -> None
         one_round()
     assert threading.active_count() == threads
     assert len(os.listdir("/proc/self/fd")) == files
+
+
+@pytest.mark.parametrize("trouble", ["unplug", "garbage"])
+def test_a_fault_zeroes_the_torque_and_stays_until_the_device_is_opened_again(
+    vendors: Bench, trouble: str
+) -> None:
+    assert vendors.repair is not None
+    assert vendors.motor_torque_nm().any()
+    getattr(vendors, trouble)()
+    with pytest.raises(DeviceError) as first:
+        run(vendors, 1000)
+    np.testing.assert_array_equal(vendors.motor_torque_nm(), 0.0)
+    vendors.repair()
+    for _ in range(2):
+        for call in (
+            vendors.device.read,
+            vendors.device.enable,
+            lambda: vendors.device.write(vendors.torque_nm),
+        ):
+            with pytest.raises(DeviceError) as again:
+                call()
+            assert str(again.value) == str(first.value)
+        vendors.tick()
+        np.testing.assert_array_equal(vendors.motor_torque_nm(), 0.0)
+        vendors.device.stop()
+    vendors.device.close()
+    vendors.device.open()
+    vendors.device.enable()
+    np.testing.assert_array_equal(vendors.motor_torque_nm(), 0.0)
+    run(vendors, 5)
+    np.testing.assert_allclose(vendors.motor_torque_nm(), vendors.torque_nm, rtol=1e-3)
+
+
+def test_stamps_tell_when_the_state_was_taken(vendors: Bench) -> None:
+    before_ns = vendors.now_ns()
+    vendors.tick()
+    vendors.tick()
+    stamp_ns = vendors.device.read().stamp_ns
+    assert before_ns < stamp_ns <= vendors.now_ns()

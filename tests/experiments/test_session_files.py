@@ -258,3 +258,20 @@ def test_remark_1_s_wall_carries_the_hand_s_force():
     assert np.abs(forces).max() < 1e-3
     assert run.remote["external_force_n"][-1][0] == pytest.approx(-2.5, abs=1e-3)
     assert np.abs(run.local["velocity_m_s"][-1]).max() < 1e-5
+
+
+def test_the_bench_s_drivers_move_figure_5_s_robots_with_its_gains():
+    bench, figure_5 = (load_session(FOLDER / f"{name}.toml") for name in ("bench_fake", "figure_5"))
+    assert bench.coupling == figure_5.coupling
+    assert certify(bench).margin_s > 0.0
+    for site in SiteId:
+        own, simulated = bench.site(site), figure_5.site(site)
+        assert own.robot == simulated.robot
+        assert own.damping == simulated.damping
+    assert bench.remote.obstacles == figure_5.remote.obstacles
+    assert bench.remote.null_space == figure_5.remote.null_space
+    assert bench.remote.sub_tasks == figure_5.remote.sub_tasks
+    directions = ("local_to_remote", "remote_to_local")
+    for direction in directions:
+        delay = getattr(bench.channel, direction).delay
+        assert delay.delay_s == getattr(figure_5.channel, direction).delay.mean_s

@@ -1,7 +1,10 @@
 """The command line, as a person meets it."""
 
 import re
+import subprocess
+import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +13,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from farhand.__main__ import app
+from hardware.registry import driver
 from site_runtime.certification import certify as certify_session
 from site_runtime.session import load_session
 from site_runtime.session_edit import edited
 from telemetry.result_file import read_result
+from tests.fakes.hd import fake_hd
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 DEMO = EXPERIMENTS / "demo.toml"
@@ -25,7 +30,18 @@ def farhand(*arguments: str | float | Path) -> Result:
 
 @pytest.mark.parametrize(
     "command",
-    ["local", "remote", "dashboard", "demo", "simulate", "certify", "design", "reproduce", None],
+    [
+        "local",
+        "remote",
+        "dashboard",
+        "demo",
+        "simulate",
+        "certify",
+        "design",
+        "reproduce",
+        "commission-quanser",
+        None,
+    ],
 )
 def test_every_command_offers_help(command: str | None) -> None:
     result = farhand(*([command] if command else []), "--help")
@@ -244,3 +260,73 @@ def test_a_session_that_is_not_there_is_a_message_not_a_traceback(command: str) 
     result = farhand(command, "nowhere.toml")
     assert result.exit_code == 2
     assert isinstance(result.exception, SystemExit)
+
+
+def test_devices_lists_drivers_and_what_a_session_uses() -> None:
+    result = farhand("devices")
+    assert result.exit_code == 0
+    for name in ("serial_pair", "simulated"):
+        assert name in result.output
+    result = farhand("devices", DEMO)
+    assert result.exit_code == 0
+    assert "local device" in result.output
+    assert "nothing missing" in result.output
+
+
+def test_devices_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = driver("simulated")
+    asked = []
+
+    def lack(settings: object) -> str:
+        asked.append(settings)
+        return "its library [of the vendor]"
+
+    monkeypatch.setattr("farhand.devices.driver", lambda _: replace(entry, missing=lack))
+    for arguments, code in (((), 0), ((DEMO,), 1)):
+        result = farhand("devices", *arguments)
+        assert result.exit_code == code
+        assert "its library [of the vendor]" in result.output
+    session = load_session(DEMO)
+    assert asked[-2:] == [session.local.device, session.remote.device]
+
+
+def test_device_check_reads_and_pushes_only_when_told_to() -> None:
+    command = ["device-check", DEMO, "--site", "local", "--seconds", "0.2"]
+    result = farhand(*command)
+    assert result.exit_code == 0
+    assert "readings/s of 1000 asked" in result.output
+    assert "q2 [rad]" in result.output
+    assert "Fz [N]" in result.output
+    assert "answer" not in result.output
+    refused = CliRunner().invoke(app, [*map(str, command), "--torque"], input="n\n")
+    assert "Push? [y/N]" in refused.output
+    assert "answer" not in refused.output
+    pushed = farhand(*command, "--torque", "--yes")
+    assert pushed.exit_code == 0, pushed.output
+    assert pushed.output.count("moves with") == 4
+
+
+def test_device_check_needs_limits_before_it_pushes(tmp_path: Path) -> None:
+    result = farhand("device-check", EXPERIMENTS / "figure_5.toml", "--site", "remote", "--torque")
+    assert result.exit_code == 2
+    assert "remote.limits.torque_nm is missing" in result.output
+    assert farhand("device-check", DEMO, "--site", "left").exit_code == 2
+
+
+@pytest.mark.processes
+def test_device_check_finds_fakes_where_there_is_no_hardware() -> None:
+    if reason := fake_hd.missing():
+        pytest.skip(reason)
+    root = EXPERIMENTS.parent
+    command = ["device-check", EXPERIMENTS / "bench_fake.toml", "--site", "local"]
+    done = subprocess.run(
+        [sys.executable, "-m", "farhand", *map(str, command), "--seconds", "0.5", "--fake"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "local device (phantom)" in done.stdout
+    assert "q2 [rad]" in done.stdout

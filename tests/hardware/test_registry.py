@@ -9,7 +9,17 @@ import pytest
 
 from hardware import registry
 from hardware.interface import DeviceConfigurationError
-from hardware.registry import ENTRY_POINT_GROUP, DeviceContext, DriverEntry, driver, drivers
+from hardware.registry import (
+    ENTRY_POINT_GROUP,
+    SENSOR_ENTRY_POINT_GROUP,
+    DeviceContext,
+    DriverEntry,
+    SensorEntry,
+    driver,
+    drivers,
+    force_sensor,
+    force_sensors,
+)
 from hardware.robot_model import PlanarArm, build_robot
 from hardware.simulated import SimulatedSettings
 
@@ -20,7 +30,7 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def offer(**targets: str) -> None:
         def entry_points(group: str) -> list[EntryPoint]:
-            assert group == "farhand.drivers"
+            assert group in ("farhand.drivers", "farhand.force_sensors")
             return [EntryPoint(name, value, group) for name, value in targets.items()]
 
         monkeypatch.setattr(registry, "entry_points", entry_points)
@@ -40,7 +50,7 @@ def test_the_simulated_driver_builds_a_device() -> None:
     device.close()
 
 
-@pytest.mark.parametrize("name", ["simulatd", "Simulated", "phantom?"])
+@pytest.mark.parametrize("name", ["simulatd", "Simulated", "nothing"])
 def test_an_unknown_name_is_answered_with_the_nearest(name: str) -> None:
     with pytest.raises(DeviceConfigurationError, match=r"no driver '.*'; nearest: .*simulated"):
         driver(name)
@@ -50,7 +60,8 @@ def test_installed_packages_may_add_drivers_but_not_replace_one(
     offer: Callable[..., None],
 ) -> None:
     offer(other="hardware.simulated:DRIVER", simulated="nowhere:DRIVER")
-    assert drivers() == ("other", "simulated")
+    assert "other" in drivers()
+    assert drivers().count("simulated") == 1
     assert isinstance(driver("other"), DriverEntry)
     assert driver("simulated").settings is SimulatedSettings
 
@@ -77,11 +88,29 @@ def test_a_broken_driver_is_explained(
 
 def test_listing_drivers_loads_none() -> None:
     program = (
-        "import sys; from hardware.registry import drivers; assert 'simulated' in drivers(); "
-        "sys.exit(bool({'hardware.simulated', 'pinocchio'} & set(sys.modules)))"
+        "import sys; from hardware.registry import drivers, force_sensors; "
+        "assert 'simulated' in drivers() and 'jr3' in force_sensors(); "
+        "sys.exit(bool({'hardware.simulated', 'hardware.jr3', 'pinocchio'} & set(sys.modules)))"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
-def test_the_entry_point_group_is_a_public_name() -> None:
+def test_installed_packages_may_add_force_sensors(offer: Callable[..., None]) -> None:
+    offer(other="hardware.jr3:DRIVER", jr3="nowhere:DRIVER", arm="hardware.simulated:DRIVER")
+    assert force_sensors() == ("arm", "jr3", "other")
+    assert isinstance(force_sensor("other"), SensorEntry)
+    assert isinstance(force_sensor("jr3"), SensorEntry)
+    with pytest.raises(DeviceConfigurationError, match="is a DriverEntry, not a SensorEntry"):
+        force_sensor("arm")
+    with pytest.raises(DeviceConfigurationError, match="is a SensorEntry, not a DriverEntry"):
+        driver("other")
+
+
+def test_an_unknown_force_sensor_is_answered_with_the_nearest() -> None:
+    with pytest.raises(DeviceConfigurationError, match=r"no force sensor 'jr4'; nearest: .*jr3"):
+        force_sensor("jr4")
+
+
+def test_the_entry_point_groups_are_public_names() -> None:
     assert ENTRY_POINT_GROUP == "farhand.drivers"
+    assert SENSOR_ENTRY_POINT_GROUP == "farhand.force_sensors"

@@ -101,6 +101,48 @@ def test_coriolis_is_symmetric_in_its_two_velocities(
 
 @many
 @given(motions())
+def test_orientation_is_a_rotation_whose_rate_is_the_joints(
+    motion: tuple[RobotModel, FloatArray, FloatArray],
+) -> None:
+    robot, q, q_dot = motion
+    R = robot.orientation(q)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    rate = (robot.orientation(q + STEP * q_dot) - robot.orientation(q - STEP * q_dot)) / (2 * STEP)
+    spin = robot.terms(q, q_dot).axes.T @ q_dot  # of the last link, in base axes
+    assert_close(rate, np.cross(spin, R, axisb=0, axisc=0))
+    np.testing.assert_array_equal(robot.orientation(q), R)
+
+
+def test_a_planar_arm_s_frame_has_x_along_the_last_link() -> None:
+    robot, q = ROBOTS["planar 4R unequal"], np.array([0.3, -0.8, 1.1, 0.4])
+    angle = q.sum()
+    np.testing.assert_allclose(
+        robot.orientation(q),
+        [
+            [math.cos(angle), -math.sin(angle), 0.0],
+            [math.sin(angle), math.cos(angle), 0.0],
+            [0.0, 0.0, 1.0],
+        ],
+        atol=1e-15,
+    )
+    chain = robot.chain(q)
+    np.testing.assert_allclose(chain[-1] - chain[-2], 0.17 * robot.orientation(q)[:, 0], atol=1e-12)
+
+
+def test_a_urdf_s_frame_is_turned_as_the_file_says() -> None:
+    path = HERE / "crooked_arm.urdf"
+    model = pin.buildModelFromUrdf(str(path), mimic=True)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    tool = data.oMf[model.getFrameId("tool", pin.FrameType.BODY)]
+    robot = ROBOTS["crooked"]
+    assert np.abs(tool.rotation - np.eye(3)).max() > 0.1
+    np.testing.assert_allclose(robot.orientation(np.zeros(robot.joints)), tool.rotation, atol=1e-12)
+
+
+@many
+@given(motions())
 def test_jacobian_is_the_derivative_of_position(
     motion: tuple[RobotModel, FloatArray, FloatArray],
 ) -> None:

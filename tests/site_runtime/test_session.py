@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from channel.delay import ConstantDelay, SinusoidDelay, TraceDelay
+from hardware.jr3 import Jr3Settings
 from hardware.simulated import SimulatedSettings
 from site_runtime.keys import SiteId
 from site_runtime.session import (
@@ -407,6 +408,59 @@ def test_a_real_robot_needs_its_limits(monkeypatch):
     assert set(problems_of(text)) == {"remote.limits.torque_nm", "remote.limits.velocity_rad_s"}
     limits = "[remote.limits]\ntorque_nm = [1, 1, 1]\nvelocity_rad_s = [1, 1, 1]\n"
     assert parse(text + limits).remote.device == Bare("bare")
+
+
+JR3 = """
+[local.force_sensor]
+driver = "jr3"
+interface = "socketcan"
+channel = "can0"
+node = 1
+mounting = "end_effector"
+rotation = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+"""
+
+
+def test_a_force_sensor_is_an_option_of_either_site():
+    session = parse(MINIMAL + JR3)
+    assert session.remote.force_sensor is None
+    assert session.local.force_sensor == Jr3Settings(
+        interface="socketcan",
+        channel="can0",
+        node=1,
+        mounting="end_effector",
+        rotation=((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    )
+    assert parse(MINIMAL + JR3.replace("local", "remote")).remote.force_sensor.node == 1
+    assert session.digest != parse(MINIMAL).digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "words"),
+    [
+        ('"jr3"', '"jr4"', "driver", ['nearest is "jr3"']),
+        ('"jr3"', '"simulated"', "driver", ['must be one of "jr3"']),
+        ('driver = "jr3"\n', "", "driver", ["is missing", '"jr3"']),
+        ("node = 1", "node = 1.5", "node", ["= 1.5", "whole number"]),
+        ("node = 1\n", "", "node", ["is missing"]),
+        ("node = 1", "node = 1\ncutoff_khz = 1", "cutoff_khz", ["rates in hertz: cutoff_hz"]),
+        ('"end_effector"', '"tool"', "mounting", ['one of "base", "end_effector"']),
+        ("[0, 0, 1]]", '[0, 0, "1"]]', "rotation[2][2]", ['= "1"']),
+        ("[0, 0, 1]]", "[0, 0]]", "rotation[2][2]", ["is missing"]),
+        ("[0, 0, 1]]", "[0, 0, 2]]", "", ["rotation is", "unit vectors"]),
+        ("node = 1", "node = 128", "", ["node is 128", "1 and 127"]),
+    ],
+)
+def test_a_force_sensor_s_settings_are_checked_like_a_device_s(old, new, key, words):
+    problem = only_problem(MINIMAL + replaced(old, new, JR3))
+    assert problem.key == f"local.force_sensor.{key}".rstrip(".")
+    for word in words:
+        assert word in str(problem)
+
+
+def test_a_force_sensor_is_a_table():
+    text = replaced("[remote]\n", '[remote]\nforce_sensor = "jr3"\n')
+    assert "driver = a driver's name" in only_problem(text).reason
 
 
 def test_every_problem_is_listed_with_its_line():

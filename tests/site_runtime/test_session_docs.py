@@ -8,7 +8,7 @@ from typing import get_args
 
 import pytest
 
-from hardware.registry import driver, drivers
+from hardware.registry import driver, drivers, force_sensor, force_sensors
 from site_runtime.session import SessionFileError, parse_session
 from site_runtime.session_problems import keys_of, tables_of
 from site_runtime.session_settings import SessionFile
@@ -29,7 +29,7 @@ def sections():
 
 
 def tables(annotation):
-    """All tables below an annotation; the drivers' settings stand for a device."""
+    """All tables below an annotation; the drivers' settings stand for a device and a sensor."""
     reached = list(tables_of(annotation))
     for argument in get_args(annotation):
         reached += tables(argument)
@@ -37,6 +37,14 @@ def tables(annotation):
         for inner in keys_of(table).values():
             reached += tables(inner)
     return list(dict.fromkeys(reached))
+
+
+def schema_tables():
+    return [
+        *tables(SessionFile),
+        *(driver(name).settings for name in drivers()),
+        *(force_sensor(name).settings for name in force_sensors()),
+    ]
 
 
 def default_of(item: Field):
@@ -51,13 +59,13 @@ def default_of(item: Field):
 
 def test_every_table_has_its_section_with_all_keys_and_no_other():
     written = [frozenset(rows) for rows in sections().values()]
-    schema = [*tables(SessionFile), *(driver(name).settings for name in drivers())]
+    schema = schema_tables()
     assert len(schema) > 30
     assert sorted(map(sorted, written)) == sorted(sorted(keys_of(table)) for table in schema)
 
 
 def test_defaults_are_the_schema_s():
-    schema = [*tables(SessionFile), *(driver(name).settings for name in drivers())]
+    schema = schema_tables()
     for table in schema:
         keys = {item.name: item for item in fields(table)}
         # tables with the same keys and different literals are told apart by their defaults
