@@ -162,7 +162,7 @@ def test_in_real_time_a_read_waits_for_nothing_and_samples_come(
     while len(stamps) < 50:
         stamps.add(device.read().stamp_ns)
         reads += 1
-    assert reads > 500  # far more than samples: it did not wait for them
+    assert reads > 2 * len(stamps)  # it did not wait for them
     device.close()
     assert board.calls[-1] == "close"
 
