@@ -600,7 +600,7 @@ def test_settings_that_cannot_work_are_refused_by_name(key: str, value: Any) -> 
         PhantomSettings(**({"joint_offset_rad": (0.0, 0.0)} | {key: value}))
 
 
-def test_a_session_gets_the_driver_for_two_joints_and_for_no_other_number() -> None:
+def test_the_driver_moves_two_joints_also_of_a_robot_of_more() -> None:
     entry = driver("phantom")
     settings = PhantomSettings((0.0, 0.0), difference_filter_s=0.002)
     assert isinstance(settings, VelocityByDifference)
@@ -610,6 +610,5 @@ def test_a_session_gets_the_driver_for_two_joints_and_for_no_other_number() -> N
         model = build_robot(PlanarArm("planar", lengths_m, (0.1,) * len(lengths_m)), None)
         return DeviceContext(model, None, now_ns=lambda: 0, session_start_ns=0, seed=0)
 
-    assert entry.create(settings, context(0.21, 0.25)).joints == 2
-    with pytest.raises(DeviceConfigurationError, match="2 joints, the robot has 3"):
-        entry.create(settings, context(0.2, 0.2, 0.2))
+    for lengths_m in ((0.21, 0.25), (0.25, 0.14, 0.21, 0.17)):
+        assert entry.create(settings, context(*lengths_m)).joints == 2
