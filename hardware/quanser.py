@@ -287,14 +287,13 @@ class QuanserDevice:
         self._board.disarm()
 
     def close(self) -> None:
-        """Stop, end sampling, disconnect; forgets a fault."""
+        """Stop, end sampling, disconnect."""
         self._quiet()
         samples, self._samples = self._samples, None
         if samples is not None:
             samples.leave()
             self._board.stop_sampling(samples.has_left)
         self._board.close()
-        self._fault = None
 
     def _newest(self) -> "_Sample":
         """Return the newest sample of a sound device; raises DeviceError, and latches."""
@@ -407,7 +406,7 @@ class _Samples:
             velocity = before.velocity_rad_s
             if number > 0:  # the sample before the first was not one period earlier
                 velocity = velocity + self._weight * (step_rad / self._period_s - velocity)
-            stamp_ns = max(round(first_ns + number * period_ns), before.stamp_ns)
+            stamp_ns = round(first_ns + number * period_ns)
             self.newest = before = _Sample(angle_rad, velocity, stamp_ns)
             number += 1
 

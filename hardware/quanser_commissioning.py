@@ -151,8 +151,8 @@ class Commissioning:
         probe = self._probe
         self.rest()
         volts = [0.0] * self.joints
-        self._board.arm(WATCHDOG_S)
         try:
+            self._board.arm(WATCHDOG_S)
             start_rad = self._angles()
             for elapsed_s in self._until(
                 2.0 * probe.ramp_s,

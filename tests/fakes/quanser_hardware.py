@@ -192,6 +192,7 @@ class Board:
         self.owner: HIL | None = None
         self.largest_current_a = [0.0] * len(self.robot.analog_channels)
         self.clock_frozen = False
+        self.hung = False  # a waiting read does not even return when its task is stopped
         self.changed = threading.Condition()
         self._dead = False
         self._reached_ns = now_ns()
@@ -530,7 +531,7 @@ class HIL:
                 if job.samples:
                     target[:] = job.samples.popleft()
                     return 1
-                if not job.running:
+                if not job.running and not board.hung:
                     return 0
                 job.waiting = True
                 board.changed.notify_all()

@@ -200,6 +200,26 @@ def test_control_c_ends_it_at_once() -> None:
     assert is_off(bench)
 
 
+def test_a_second_control_c_does_not_leave_motors_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = QuanserBench()
+    person = Person(bench, interrupt_at=1000)
+    bench.plant.locked = [True, True]
+    examined = commissioning(bench, person)
+    make_safe, calls = examined._board.make_safe, []
+
+    def interrupted() -> None:
+        calls.append(bench.board.current_a())
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        make_safe()
+
+    monkeypatch.setattr(examined._board, "make_safe", interrupted)
+    with pytest.raises(KeyboardInterrupt), examined:
+        examined.signs(0, 1)
+    assert any(calls[1])  # still flowing when it was tried again
+    assert is_off(bench)
+
+
 def unplug(bench: QuanserBench) -> None:
     bench.board.unplug()
 
