@@ -1,6 +1,7 @@
 """A PHANToM Premium 1.5 as a planar arm of two joints, through OpenHaptics."""
 
 import math
+import os
 import time
 from dataclasses import dataclass
 from typing import Literal
@@ -108,6 +109,7 @@ class PhantomDevice:
                 settings.device_name,
                 settings.motor_torque_limit_nm,
                 settings.timeout_s,
+                _above(os.sched_getparam(0).sched_priority),
             )
         )
         self._fault = None
@@ -257,6 +259,11 @@ class PhantomDevice:
         else:
             return
         self._last_rad, self._last_ns = position_rad.copy(), stamp_ns
+
+
+def _above(priority: int) -> int:
+    """Return the servo's priority for the site's: its frames are short and must not wait."""
+    return min(priority + 1, os.sched_get_priority_max(os.SCHED_FIFO)) if priority > 0 else 0
 
 
 def _create(settings: PhantomSettings, context: DeviceContext) -> PhantomDevice:

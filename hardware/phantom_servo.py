@@ -113,12 +113,16 @@ class ServoMemory:
 
 @dataclass(frozen=True, slots=True)
 class ServoOptions:
-    """What the site tells its servo process; torque limits of thigh and shin."""
+    """What the site tells its servo process; torque limits of thigh and shin.
+
+    `priority` is of SCHED_FIFO, 0 for ordinary scheduling.
+    """
 
     library: str
     device_name: str
     torque_limit_nm: tuple[float, float]
     timeout_s: float
+    priority: int = 0
 
     def to_json(self) -> str:
         """Return the options for a command line."""
@@ -273,7 +277,11 @@ def main() -> None:
     memory = ServoMemory(mmap.mmap(int(sys.argv[1]), ServoMemory.SIZE))
     values = json.loads(sys.argv[2])
     values["torque_limit_nm"] = tuple(values["torque_limit_nm"])
-    servo = Servo(ServoOptions(**values), memory)
+    options = ServoOptions(**values)
+    if options.priority > 0:
+        with contextlib.suppress(PermissionError):  # the vendor's thread inherits it
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(options.priority))
+    servo = Servo(options, memory)
     gc.disable()  # the callback makes no cycles
     try:
         servo.start()

@@ -9,13 +9,14 @@ on which the torque that left was based.
 import argparse
 import json
 import mmap
+import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,11 @@ class ServoThread:
     def __init__(self, options: ServoOptions) -> None:
         self.memory = ServoMemory(mmap.mmap(-1, ServoMemory.SIZE))
         self._servo = Servo(options, self.memory)
+        policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+        if options.priority > 0:  # for the scheduler's thread to inherit
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(options.priority))
         self._servo.start()
+        os.sched_setscheduler(0, policy, parameters)
         self.wait(lambda: self.memory.state.get()[0] != 0, 5.0)
 
     def wait(self, condition: Callable[[], Any], limit_s: float) -> bool:
@@ -53,7 +58,7 @@ class ServoThread:
 
 
 def measure(
-    place: str, seconds: float, busy_ns: int, real_time: Literal["try", "off"], out: Path
+    place: str, seconds: float, busy_ns: int, real_time: RealTimeSettings, out: Path
 ) -> None:
     """Run one loop; write the samples of every measure [µs]."""
     if place == "thread":
@@ -70,7 +75,7 @@ def measure(
         torque_ramp_s=0.0,
         timeout_s=1.0,
     )
-    with apply_real_time(RealTimeSettings(mode=real_time)):
+    with apply_real_time(real_time):
         device = PhantomDevice(settings)
         device.open()
         device.enable()
@@ -107,12 +112,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--busy-ms", type=float, default=0.5)
     parser.add_argument("--real-time", choices=("try", "off"), default="off")
+    parser.add_argument("--priority", type=int, default=80)
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     busy_ns = round(options.busy_ms * 1e6)
     if options.one:
         place, out = options.one
-        measure(place, options.seconds, busy_ns, options.real_time, Path(out))
+        real_time = RealTimeSettings(options.real_time, options.priority)
+        measure(place, options.seconds, busy_ns, real_time, Path(out))
         return
     pooled: dict[str, list[dict[str, Any]]] = {"process": [], "thread": []}
     with tempfile.TemporaryDirectory() as folder:
