@@ -280,6 +280,13 @@ def test_stop_and_close_return_with_zero_torque_sent(pushing: Bench) -> None:
     assert (pushing.fake.block.running, pushing.fake.block.open) == (0, 0)
 
 
+def test_enabling_again_returns_with_zero_torque_sent(pushing: Bench) -> None:
+    pushing.device.enable()
+    assert pushing.fake.sent_nm == [0.0, 0.0, 0.0]
+    pushing.push()
+    assert any(pushing.fake.sent_nm)
+
+
 def test_the_vendors_rules_are_kept(pushing: Bench) -> None:
     pushing.push(100)
     pushing.device.stop()
