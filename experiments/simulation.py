@@ -10,7 +10,8 @@ from local_site.site import build_local_site
 from remote_site.site import build_remote_site
 from site_runtime.assembly import Surroundings
 from site_runtime.clock import ManualClock
-from site_runtime.session import Session
+from site_runtime.keys import SiteId
+from site_runtime.session import Session, SessionError
 from site_runtime.site import Site
 from telemetry.rows import RowArray
 from telemetry.stream import decode_batch
@@ -37,6 +38,7 @@ class Simulation:
     """
 
     def __init__(self, session: Session) -> None:
+        _refuse_real_devices(session)
         self.period_ns = session.period_ns
         self._start_ns = _warm_up_ns(session)
         self.clock = ManualClock()
@@ -104,6 +106,22 @@ class Simulation:
         count = min(since_ns, 1_000_000_000) // self.period_ns
         local, remote = (site.telemetry.last(count) for site in (self.local, self.remote))
         return Run(local, remote, ())
+
+
+def _refuse_real_devices(session: Session) -> None:
+    """Raise SessionError for what would open a vendor's library or a bus on a manual clock."""
+    for site in SiteId:
+        own = session.site(site)
+        if own.device.driver != "simulated":
+            raise SessionError(
+                f'{site.label}.device.driver = "{own.device.driver}": simulation moves simulated '
+                'robots only; use driver = "simulated", or run the site itself'
+            )
+        if own.force_sensor is not None:
+            raise SessionError(
+                f"{site.label}.force_sensor: simulation knows the force by itself; leave it out, "
+                "or run the site itself"
+            )
 
 
 def _warm_up_ns(session: Session) -> int:

@@ -114,6 +114,22 @@ def test_certify_names_the_theorem(session: str, theorem: str) -> None:
     assert f"certified by {theorem}" in result.output
 
 
+def test_simulate_opens_no_real_device() -> None:
+    result = farhand("simulate", EXPERIMENTS / "bench_fake.toml", "--duration", "1")
+    assert result.exit_code == 2
+    assert 'local.device.driver = "phantom"' in result.output
+
+
+def test_simulate_opens_no_force_sensor(tmp_path: Path) -> None:
+    text = (EXPERIMENTS / "bench_fake.toml").read_text(encoding="utf-8")
+    simulated = {"driver": "simulated", "initial_position_rad": [0.8, 1.6]}
+    session = tmp_path / "session.toml"
+    session.write_text(edited(text, {"local.device": simulated}), encoding="utf-8")
+    result = farhand("simulate", session, "--duration", "1")
+    assert result.exit_code == 2
+    assert "local.force_sensor" in result.output
+
+
 @pytest.mark.parametrize(("session", "told"), [("seven_dof", True), ("demo", False)])
 def test_certify_tells_that_losses_are_not_in_the_round_trip(session: str, told: bool) -> None:
     result = farhand("certify", EXPERIMENTS / f"{session}.toml")
