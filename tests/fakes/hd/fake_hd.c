@@ -417,6 +417,19 @@ void hdUpdateCalibration(HDenum style) {
     block->needs_calibration = 0;
 }
 
+/* Declared in the vendor's header, described nowhere: they are there, and change nothing. */
+void hdUpdateCalibrationMessage(HDenum style) {
+    if (style != ENCODER_RESET) push(INVALID_VALUE);
+}
+
+void hdScaleGimbalAngles(double x, double y, double z, double transform[16]) {
+    (void)x; (void)y; (void)z; (void)transform;
+}
+
+HDboolean hdDeploymentLicense(const char *vendor, const char *application, const char *password) {
+    return vendor != NULL && application != NULL && password != NULL;
+}
+
 /* ---- parameters ---- */
 
 static int doubles(HDenum what, double out[6]) {
