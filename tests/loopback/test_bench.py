@@ -14,6 +14,7 @@ import sys
 import time
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,8 +25,9 @@ from site_runtime.keys import SiteId
 from site_runtime.session import Session, load_session
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray
-from tests.fakes.bench import ROOT, fakes
+from tests.fakes.bench import ROOT, device_coordinates, fakes
 from tests.fakes.hd import fake_hd
+from tests.fakes.plant import ENVIRONMENT_VARIABLE, PlantMemory
 from tests.loopback.test_two_processes import free_endpoints
 
 pytestmark = pytest.mark.processes
@@ -46,6 +48,7 @@ MOVING_M = 0.035
 APART_M = 0.004
 MIDPOINT_M = 0.002
 FORCE_N = 0.03
+SAME_RAD = 0.005  # encoders and what is left of the motion
 
 
 @dataclass
@@ -55,6 +58,7 @@ class Outcome:
     rows: dict[SiteId, RowArray]
     time_s: dict[SiteId, np.ndarray]
     printed: str
+    plant_rad: dict[SiteId, np.ndarray]
 
     def position_m(self, site: SiteId, at_s: float) -> np.ndarray:
         rows, time_s = self.rows[site], self.time_s[site]
@@ -76,7 +80,7 @@ def plain(session: Session) -> Outcome:
     figure_5 = load_session(FIGURE_5)
     run = Simulation(replace(figure_5, channel=session.channel, loop=session.loop)).run(HAND_S)
     assert run.failures == ()
-    return outcome(run, "")
+    return outcome(run, "", {})
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +98,7 @@ def bench(session: Session) -> Outcome:
     )
 
 
-def outcome(run: Run, printed: str) -> Outcome:
+def outcome(run: Run, printed: str, plant_rad: dict[SiteId, np.ndarray]) -> Outcome:
     """Count time from the hand's: it is a second before it first pushes."""
     rows = {SiteId.LOCAL: run.local, SiteId.REMOTE: run.remote}
     push_n = run.local["external_force_n"][:, 0]
@@ -102,10 +106,11 @@ def outcome(run: Run, printed: str) -> Outcome:
     assert half > 0, f"no hand was felt\n{printed}"
     start_ns = run.local["stamp_ns"][half] - 3_000_000_000
     time_s = {site: (own["stamp_ns"] - start_ns) * 1e-9 for site, own in rows.items()}
-    return Outcome(rows, time_s, printed)
+    return Outcome(rows, time_s, printed, plant_rad)
 
 
-def run_bench(session: Session) -> tuple[Run, str]:
+def run_bench(session: Session) -> tuple[Run, str, dict[SiteId, np.ndarray]]:
+    """Return both sites' rows, what they printed, and where the plants' joints really were."""
     endpoints = dict(zip(SiteId, free_endpoints(2), strict=True))
     rows: dict[SiteId, list[RowArray]] = {site: [] for site in SiteId}
     with ExitStack() as stack:
@@ -136,8 +141,18 @@ def run_bench(session: Session) -> tuple[Run, str]:
                 rows[SiteId(batch.site)].append(batch.rows)
             time.sleep(0.02)
         printed = "\n".join(daemon.communicate()[0] for daemon in daemons)
+        plant_rad = {site: joints_rad(session, site, environments[site]) for site in SiteId}
     assert all(rows.values()), printed
-    return Run(*(np.concatenate(rows[site]) for site in SiteId), ()), printed
+    return Run(*(np.concatenate(rows[site]) for site in SiteId), ()), printed, plant_rad
+
+
+def joints_rad(session: Session, site: SiteId, environment: dict[str, str]) -> np.ndarray:
+    """Serial joint angles of a plant, by the coordinates that it was started with."""
+    plant = PlantMemory(Path(environment[ENVIRONMENT_VARIABLE]))
+    A, b = device_coordinates(session.site(site).device)
+    d = np.array(plant.read().position_rad)
+    plant.close()
+    return np.asarray(A @ d + b)
 
 
 def test_both_sites_engage_and_stay_so(bench: Outcome) -> None:
@@ -145,6 +160,13 @@ def test_both_sites_engage_and_stay_so(bench: Outcome) -> None:
     for site, rows in bench.rows.items():
         driven = rows[(bench.time_s[site] > 0.5) & (bench.time_s[site] < HAND_S - 0.5)]
         assert (driven["state"] == State.ENGAGED).mean() > 0.97, bench.printed
+
+
+@pytest.mark.parametrize("site", SiteId)
+def test_the_drivers_say_where_the_joints_really_are(bench: Outcome, site: SiteId) -> None:
+    moved_rad = np.ptp(bench.rows[site]["q"], axis=0)
+    assert moved_rad.min() > 10.0 * SAME_RAD
+    np.testing.assert_allclose(bench.rows[site]["q"][-1], bench.plant_rad[site], 0.0, SAME_RAD)
 
 
 def test_the_sensor_feels_the_hand_as_it_pushes_and_pulls(bench: Outcome, plain: Outcome) -> None:
