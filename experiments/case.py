@@ -36,8 +36,8 @@ class Case:
     """A session file, relative to experiments/, the keys changed in it, and how long it runs.
 
     `name` names the case in its study. With `until_settled` the run ends once the sites have been
-    within a millimetre of each other for a second; with `energy` the Lyapunov–Krasovskii
-    functional is evaluated at every tick, over windows of `energy_window_s` (d̄_l, d̄_r).
+    within a millimetre of each other for a second; with `energy_window_s`, (d̄_l, d̄_r), the
+    Lyapunov–Krasovskii functional is evaluated at every tick over these windows.
     """
 
     name: str

@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 from experiments.case import Case, Outcome
 from experiments.report import Section
+from site_runtime.session_edit import TomlValue
 
 Outcomes: TypeAlias = Mapping[str, Outcome]
 
@@ -19,3 +20,8 @@ class Study:
     title: str
     cases: tuple[Case, ...]
     section: Callable[[Outcomes, Path], Section]
+
+
+def both_ways(key: str, value: TomlValue | None) -> dict[str, TomlValue | None]:
+    """Return the changes that set a key of [channel.…] alike in both directions."""
+    return {f"channel.{way}.{key}": value for way in ("local_to_remote", "remote_to_local")}

@@ -5,7 +5,7 @@ from pathlib import Path
 from experiments.case import Case
 from experiments.plots import COLOURS, curves, panels, save
 from experiments.report import Claim, Figure, Section, Table, Verdict
-from experiments.study import Outcomes, Study
+from experiments.study import Outcomes, Study, both_ways
 from site_runtime.certification import certify
 from site_runtime.session_edit import TomlValue
 
@@ -17,7 +17,7 @@ _PAPER_LATE = Case(
     "paper_gains_late",
     "paper_free.toml",
     260.0,
-    {"channel.local_to_remote.delay": _LONG_DELAY, "channel.remote_to_local.delay": _LONG_DELAY},
+    both_ways("delay", _LONG_DELAY),
     until_settled=True,
 )
 _ROWS = {

@@ -7,7 +7,7 @@ from pathlib import Path
 from experiments.case import Case, Outcome
 from experiments.plots import MapPoint, map_figure
 from experiments.report import Claim, Figure, Section, Table, Verdict
-from experiments.study import Outcomes, Study
+from experiments.study import Outcomes, Study, both_ways
 from site_runtime.certification import Certification, certify
 from site_runtime.session_edit import TomlValue
 
@@ -37,8 +37,7 @@ class _Map:
             {
                 **self.changes,
                 "coupling.stiffness_n_per_m": [float(stiffness_n_per_m)] * self.axes,
-                "channel.local_to_remote.delay": delay,
-                "channel.remote_to_local.delay": delay,
+                **both_ways("delay", delay),
             },
             trace_hz=10,
             until_settled=True,
@@ -72,8 +71,7 @@ _MAPS = (
         {
             "local.operator": None,
             "remote.environment": None,
-            "channel.local_to_remote.loss": None,
-            "channel.remote_to_local.loss": None,
+            **both_ways("loss", None),
         },
     ),
 )

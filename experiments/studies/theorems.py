@@ -7,7 +7,7 @@ from experiments.measures import Measures
 from experiments.plots import COLOURS, curves, panels, save
 from experiments.report import Claim, Figure, Section, Table, Verdict
 from experiments.studies.certificates import PAPER, paper_trip_s
-from experiments.study import Outcomes, Study
+from experiments.study import Outcomes, Study, both_ways
 from site_runtime.session_edit import TomlValue
 
 _DURATION_S = 10.0
@@ -22,10 +22,6 @@ _BURSTS: TomlValue = {"enter_burst": 0.005, "leave_burst": 0.03}
 _QUARTER: TomlValue = [2.53, 2.53]
 
 
-def _both_ways(key: str, value: TomlValue) -> dict[str, TomlValue | None]:
-    return {f"channel.{way}.{key}": value for way in ("local_to_remote", "remote_to_local")}
-
-
 def _case(
     name: str,
     changes: dict[str, TomlValue | None],
@@ -37,14 +33,14 @@ def _case(
 
 _CERTIFIED = {
     "sinusoidal delay": _case("sinusoid", {}),
-    "constant delay": _case("constant", _both_ways("delay", _CONSTANT)),
-    "delay jumping every tick": _case("jumping", _both_ways("delay", _JUMPING)),
-    "burst loss": _case("bursts", _both_ways("loss", _BURSTS), _BURST_WINDOW_S),
+    "constant delay": _case("constant", both_ways("delay", _CONSTANT)),
+    "delay jumping every tick": _case("jumping", both_ways("delay", _JUMPING)),
+    "burst loss": _case("bursts", both_ways("loss", _BURSTS), _BURST_WINDOW_S),
 }
 _UNDERDAMPED = _case(
     "quarter",
     {
-        **_both_ways("delay", _CONSTANT),
+        **both_ways("delay", _CONSTANT),
         "local.damping.task_n_s_per_m": _QUARTER,
         "remote.damping.task_n_s_per_m": _QUARTER,
     },
