@@ -44,13 +44,32 @@ class DeviceState:
     """One reading of a device.
 
     `wrench` (6,) [N, N·m] is what the hand or the environment exerts ON the robot at the end
-    effector, in base axes; `stamp_ns` is on the site's monotonic clock.
+    effector, in base axes; `stamp_ns` is on the site's monotonic clock. `clutch` says that the
+    device's own button, if it has one, is held down.
     """
 
     position_rad: FloatArray
     velocity_rad_s: FloatArray
     wrench: FloatArray
     stamp_ns: int
+    clutch: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointStops:
+    """Where a robot's joints end: lower ≤ A q ≤ upper, `matrix` A (m, n), bounds (m,) [rad].
+
+    A row with one entry is a joint's own stop; one with more, a stop that couples joints.
+    """
+
+    matrix: FloatArray
+    lower_rad: FloatArray
+    upper_rad: FloatArray
+
+    @classmethod
+    def none(cls, joints: int) -> "JointStops":
+        """Return no stops at all."""
+        return cls(np.zeros((0, joints)), np.zeros(0), np.zeros(0))
 
 
 class Device(Protocol):
@@ -63,6 +82,11 @@ class Device(Protocol):
     @property
     def joints(self) -> int:
         """Number of joints."""
+        ...
+
+    @property
+    def joint_stops(self) -> JointStops:
+        """Where the joints end, as far as the driver knows; the same from creation on."""
         ...
 
     def open(self) -> None:

@@ -14,6 +14,7 @@ from hardware.interface import (
     DeviceError,
     DeviceState,
     FloatArray,
+    JointStops,
 )
 from hardware.phantom_kinematics import Parallelogram, ThirdAngleCheck
 from hardware.phantom_process import ServoProcess
@@ -97,6 +98,11 @@ class PhantomDevice:
     def joints(self) -> int:
         """Two: thigh and shin."""
         return 2
+
+    @property
+    def joint_stops(self) -> JointStops:
+        """None are known."""
+        return JointStops.none(2)
 
     def open(self) -> None:
         """Start the servo process and take the device, outputs off."""

@@ -16,7 +16,13 @@ from typing import Literal, NoReturn
 
 import numpy as np
 
-from hardware.interface import DeviceConfigurationError, DeviceError, DeviceState, FloatArray
+from hardware.interface import (
+    DeviceConfigurationError,
+    DeviceError,
+    DeviceState,
+    FloatArray,
+    JointStops,
+)
 from hardware.quanser_board import (
     OUTPUT_RANGE_V,
     USUAL_MODULE,
@@ -211,6 +217,11 @@ class QuanserDevice:
     def joints(self) -> int:
         """Number of joints."""
         return self._joints
+
+    @property
+    def joint_stops(self) -> JointStops:
+        """None are known."""
+        return JointStops.none(self._joints)
 
     def open(self) -> None:
         """Connect to the board, outputs off, and start sampling; zero the encoders if asked to."""

@@ -1,8 +1,10 @@
 """A device whose wrench is measured by a force sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from hardware.interface import Device, DeviceError, DeviceState, FloatArray, ForceSensor
+from hardware.interface import Device, DeviceError, DeviceState, FloatArray, ForceSensor, JointStops
 from hardware.robot_model import RobotModel
 
 
@@ -27,6 +29,11 @@ class SensedDevice:
     def joints(self) -> int:
         """Number of joints."""
         return self._device.joints
+
+    @property
+    def joint_stops(self) -> JointStops:
+        """Those of the device."""
+        return self._device.joint_stops
 
     def open(self) -> None:
         """Open the sensor, which tares it, and the device; both or none."""
@@ -57,7 +64,7 @@ class SensedDevice:
         if self._turns:
             R = self._model.orientation(state.position_rad)
             wrench = np.concatenate((R @ wrench[:3], R @ wrench[3:]))
-        return DeviceState(state.position_rad, state.velocity_rad_s, wrench, state.stamp_ns)
+        return replace(state, wrench=wrench)
 
     def write(self, torque_nm: FloatArray) -> None:
         """Command joint torques (n,) [N·m]."""

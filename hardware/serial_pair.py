@@ -21,6 +21,7 @@ from hardware.interface import (
     DeviceSettings,
     DeviceState,
     FloatArray,
+    JointStops,
     VelocityByDifference,
 )
 from hardware.registry import DeviceContext, DriverEntry, driver, missing
@@ -94,6 +95,19 @@ class SerialPair:
         """Number of joints."""
         return self._joints
 
+    @property
+    def joint_stops(self) -> JointStops:
+        """Those of both parts."""
+        near, far = (part.joint_stops for part in self._parts.values())
+        matrix = np.zeros((len(near.matrix) + len(far.matrix), self._joints))
+        matrix[: len(near.matrix), : self._split] = near.matrix
+        matrix[len(near.matrix) :, self._split :] = far.matrix
+        return JointStops(
+            matrix,
+            np.concatenate((near.lower_rad, far.lower_rad)),
+            np.concatenate((near.upper_rad, far.upper_rad)),
+        )
+
     def open(self) -> None:
         """Open both, or neither."""
         if self._opened:
@@ -141,6 +155,7 @@ class SerialPair:
             np.concatenate((near.velocity_rad_s, far.velocity_rad_s)),
             far.wrench,
             min(near.stamp_ns, far.stamp_ns),
+            near.clutch or far.clutch,
         )
 
     def write(self, torque_nm: FloatArray) -> None:

@@ -14,6 +14,7 @@ from hardware.interface import (
     DeviceError,
     DeviceState,
     FloatArray,
+    JointStops,
 )
 from hardware.registry import DeviceContext, DriverEntry
 from hardware.robot_model import RobotModel
@@ -121,6 +122,11 @@ class SimulatedDevice:
     def joints(self) -> int:
         """Number of joints."""
         return self._model.joints
+
+    @property
+    def joint_stops(self) -> JointStops:
+        """None are known."""
+        return JointStops.none(self.joints)
 
     def open(self) -> None:
         """Put the arm at its initial position, at rest."""
