@@ -8,9 +8,10 @@ import numpy.typing as npt
 
 from channel.clock_offset import ClockOffset, OffsetEstimate
 from channel.delay import Direction
+from channel.greatest_age import GreatestAge
 from channel.injection import DelayMode, Injection
 from channel.link import Link
-from channel.packet import NO_EPOCH, NO_STAMP, Packet, PacketError, Reject, decode, encode
+from channel.packet import NO_AGE, NO_EPOCH, NO_STAMP, Packet, PacketError, Reject, decode, encode
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -107,6 +108,7 @@ class Channel:
         self._heard_ns = 0
         self._mismatch_ns: int | None = None
         self._used_stamp_ns = NO_STAMP
+        self._greatest_age = GreatestAge()
         self._sequence = 0
         self._due_ns: int | None = None
         self._asked_ns = 0
@@ -132,6 +134,7 @@ class Channel:
             self._used_stamp_ns = NO_STAMP
             return None
         self._used_stamp_ns = packet.stamp_ns
+        self._greatest_age.add(now_ns, now_ns - packet.stamp_ns)
         answered = packet.echo_epoch == self._epoch and packet.used_stamp_ns != NO_STAMP
         return PeerSample(
             packet.stamp_ns,
@@ -176,6 +179,7 @@ class Channel:
             echo_stamp_ns=newest.stamp_ns if newest is not None else NO_STAMP,
             echo_arrival_ns=self._heard_ns,
             used_stamp_ns=self._used_stamp_ns,
+            greatest_age_ns=self._greatest_age.value_ns,
             vectors=vectors,
         )
         if not self._link.send(data):
@@ -198,6 +202,24 @@ class Channel:
     def peer_confirmed(self) -> bool:
         """Whether the newest valid packet answers this very run of mine: no recording can."""
         return self._newest is not None and self._newest.echo_epoch == self._epoch
+
+    @property
+    def peer_taken(self) -> bool:
+        """Whether the newest valid packet answers another site than this one: one is enough."""
+        return self._newest is not None and self._newest.echo_epoch not in (NO_EPOCH, self._epoch)
+
+    @property
+    def loop_bound_ns(self) -> int | None:
+        """Greatest age of the samples in use of late, mine plus the peer's [ns]; None: not yet.
+
+        At ticks, so that each site's holds one tick more. Clocks need not agree: their difference
+        enters the two with opposite signs.
+        """
+        mine_ns = self._greatest_age.value_ns
+        if mine_ns == NO_AGE or self._newest is None or not self.peer_confirmed:
+            return None
+        theirs_ns = self._newest.greatest_age_ns
+        return None if theirs_ns == NO_AGE else mine_ns + theirs_ns
 
     @property
     def peer_present(self) -> bool:
@@ -292,6 +314,7 @@ class Channel:
         self.counters.peer_restarts += 1
         self._injection.clear()
         self._clock_offset.reset()
+        self._greatest_age.reset()
         self._used_stamp_ns = NO_STAMP
 
     def _due(self, now_ns: int) -> bool:

@@ -11,14 +11,16 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 MAGIC = b"FARH"
-VERSION = 1
+VERSION = 2
 NO_STAMP = -1
 """In `used_stamp_ns`: the sender was using no sample of its peer's."""
+NO_AGE = -(2**63)
+"""In `greatest_age_ns`: the same, within the time that it looks back on."""
 NO_EPOCH = 0
 """In `echo_epoch`: the sender has heard no peer; the other echo fields then mean nothing."""
 
 _DIMENSIONS = (2, 3)
-_HEADER = struct.Struct("<4sBBBBQQQqQqqq")
+_HEADER = struct.Struct("<4sBBBBQQQqQqqqq")
 _CHECKSUM = struct.Struct("<I")
 _PREFIX = struct.Struct("<4sB")
 _SIZES = {z: _HEADER.size + 3 * 8 * z + _CHECKSUM.size for z in _DIMENSIONS}
@@ -54,7 +56,8 @@ class Packet:
     """One packet; vectors (z,) in base axes, z = 2 or 3, read-only.
 
     Stamps are nanoseconds: `stamp_ns` and `echo_arrival_ns` on the sender's monotonic clock,
-    `echo_stamp_ns` and `used_stamp_ns` on its peer's.
+    `echo_stamp_ns` and `used_stamp_ns` on its peer's. `greatest_age_ns` is a difference of the two
+    clocks, the sender's minus its peer's.
     """
 
     site: int
@@ -67,6 +70,7 @@ class Packet:
     echo_stamp_ns: int
     echo_arrival_ns: int
     used_stamp_ns: int
+    greatest_age_ns: int
     position_m: FloatArray
     velocity_m_s: FloatArray
     force_n: FloatArray
@@ -84,6 +88,7 @@ def encode(
     echo_stamp_ns: int,
     echo_arrival_ns: int,
     used_stamp_ns: int,
+    greatest_age_ns: int,
     vectors: FloatArray,
 ) -> bytes:
     """Return the bytes of a packet.
@@ -105,6 +110,7 @@ def encode(
             echo_stamp_ns,
             echo_arrival_ns,
             used_stamp_ns,
+            greatest_age_ns,
         )
         + vectors.astype("<f8", copy=False).tobytes()
     )
@@ -138,6 +144,7 @@ def decode(data: bytes) -> Packet:
         echo_stamp_ns,
         echo_arrival_ns,
         used_stamp_ns,
+        greatest_age_ns,
     ) = _HEADER.unpack_from(data)
     expected = _SIZES.get(dimension)
     if expected is None:
@@ -164,6 +171,7 @@ def decode(data: bytes) -> Packet:
         echo_stamp_ns,
         echo_arrival_ns,
         used_stamp_ns,
+        greatest_age_ns,
         vectors[:dimension],
         vectors[dimension : 2 * dimension],
         vectors[2 * dimension :],

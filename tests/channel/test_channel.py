@@ -16,7 +16,7 @@ from channel.delay import (
 )
 from channel.injection import DelayMode
 from channel.memory_link import MemoryLink, memory_links
-from channel.packet import Reject, encode
+from channel.packet import NO_AGE, Reject, encode
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -65,6 +65,7 @@ class Wire:
             "echo_stamp_ns": 0,
             "echo_arrival_ns": 0,
             "used_stamp_ns": 0,
+            "greatest_age_ns": 0,
             "vectors": np.zeros((3, 2)),
         }
         return encode(**(fields | changes))
@@ -158,11 +159,56 @@ def test_round_trip_follows_a_varying_delay_without_a_common_clock() -> None:
             assert abs(at_remote.age_ns - expected * 1e9) < 1.1 * MS
     assert local.offset is not None
     assert abs(local.offset.offset_ns + ahead_ns) <= local.offset.uncertainty_ns
-    assert local.offset.uncertainty_ns < 3.1 * MS
-    assert local.one_way_ns is not None
-    assert abs(local.one_way_ns - 3 * MS) <= local.offset.uncertainty_ns
-    assert local.counters.late == 0, "0.05 s absorbs the network"
-    assert remote.counters.late > 0, "0.1 + 0.1 sin t touches zero"
+
+
+def test_loop_bound_is_the_sum_of_the_greatest_ages_whatever_the_clocks() -> None:
+    """Delays in opposite phase: no loop is ever as old as the two greatest ages together."""
+    ahead_ns = 3 * 86_400 * S
+    links = memory_links()
+    forth = SinusoidDelay(0.1, 0.08, angular_frequency_rad_s=12.0)
+    back = SinusoidDelay(0.1, 0.08, angular_frequency_rad_s=12.0, phase_rad=np.pi)
+    local = channel(links[0], 0, direction=Direction(forth), mode="exact")
+    remote = channel(
+        links[1], 1, direction=Direction(back), mode="exact", session_start_ns=ahead_ns
+    )
+    assert local.loop_bound_ns is None
+    oldest_ns = 0
+    for k in range(4000):
+        at_local = tick(local, k * MS)
+        tick(remote, k * MS + ahead_ns)
+        if k > 2000:
+            assert at_local is not None
+            assert at_local.round_trip_ns is not None
+            oldest_ns = max(oldest_ns, at_local.round_trip_ns)
+            for site in (local, remote):
+                assert site.loop_bound_ns is not None
+                assert abs(site.loop_bound_ns - 360 * MS) <= 3 * MS
+    assert oldest_ns < 345 * MS, "the loop's age at one moment does not show the bound"
+
+
+def test_loop_bound_holds_the_greatest_age_for_a_while_then_forgets_it() -> None:
+    wire = Wire()
+    wire.hear(1 * MS, wire.packet(1, greatest_age_ns=7 * MS))
+    wire.hear(200 * MS)
+    assert wire.channel.loop_bound_ns == (199 + 7) * MS
+    for k in range(201, 1500):
+        wire.hear(k * MS, wire.packet(k, greatest_age_ns=5 * MS))
+        if k == 600:
+            assert wire.channel.loop_bound_ns == (199 + 5) * MS
+    assert wire.channel.loop_bound_ns == 5 * MS
+
+
+def test_loop_bound_is_unknown_until_both_use_samples_of_this_run() -> None:
+    wire = Wire()
+    assert wire.channel.loop_bound_ns is None
+    wire.hear(1 * MS, wire.packet(1, greatest_age_ns=NO_AGE))
+    assert wire.channel.loop_bound_ns is None
+    wire.hear(2 * MS, wire.packet(2, echo_epoch=999))
+    assert wire.channel.loop_bound_ns is None
+    assert wire.channel.peer_taken
+    wire.hear(3 * MS, wire.packet(3))
+    assert wire.channel.loop_bound_ns == 0
+    assert not wire.channel.peer_taken
 
 
 def test_round_trip_counts_the_spacing_and_the_hold() -> None:

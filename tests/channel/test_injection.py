@@ -25,7 +25,7 @@ S = 1_000_000_000
 def packet(stamp_ns: int, sequence: int) -> Packet:
     zero = np.zeros(2)
     return Packet(
-        0, 0, 0, 1, sequence, stamp_ns, NO_EPOCH, NO_STAMP, NO_STAMP, NO_STAMP, zero, zero, zero
+        0, 0, 0, 1, sequence, stamp_ns, NO_EPOCH, NO_STAMP, NO_STAMP, NO_STAMP, 0, zero, zero, zero
     )
 
 

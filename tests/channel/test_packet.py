@@ -29,6 +29,7 @@ fields = st.fixed_dictionaries(
         "echo_stamp_ns": i64,
         "echo_arrival_ns": i64,
         "used_stamp_ns": i64,
+        "greatest_age_ns": i64,
     }
 )
 
@@ -45,6 +46,7 @@ def example(dimension: int = 3) -> bytes:
         echo_stamp_ns=8,
         echo_arrival_ns=9,
         used_stamp_ns=NO_STAMP,
+        greatest_age_ns=0,
         vectors=np.arange(3.0 * dimension).reshape(3, dimension),
     )
 
@@ -70,12 +72,12 @@ def test_what_is_encoded_is_decoded(values: dict[str, int], floats: np.ndarray) 
 
 def test_layout_is_the_documented_one() -> None:
     data = example(dimension=2)
-    assert len(data) == 124
+    assert len(data) == 132
     assert data[:16] == b"FARH" + bytes([VERSION, 1, 2, 2]) + bytes(range(1, 9))
-    assert struct.unpack_from("<QQqQqqq", data, 16) == (4, 5, 6, 7, 8, 9, -1)
-    assert struct.unpack_from("<6d", data, 72) == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-    assert struct.unpack_from("<I", data, 120) == (zlib.crc32(data[:120]),)
-    assert len(example(dimension=3)) == 148
+    assert struct.unpack_from("<QQqQqqqq", data, 16) == (4, 5, 6, 7, 8, 9, -1, 0)
+    assert struct.unpack_from("<6d", data, 80) == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+    assert struct.unpack_from("<I", data, 128) == (zlib.crc32(data[:128]),)
+    assert len(example(dimension=3)) == 156
 
 
 def test_decoded_vectors_are_read_only() -> None:
@@ -124,14 +126,14 @@ def test_a_resealed_mutation_is_a_packet_or_refused(place: int, value: int) -> N
     ("data", "reason"),
     [
         (b"", Reject.LENGTH),
-        (example()[:71], Reject.LENGTH),
+        (example()[:79], Reject.LENGTH),
         (example() + b"\0", Reject.LENGTH),
         (b"PICK" + example()[4:], Reject.MAGIC),
         (b"FARH" + bytes([VERSION + 1]) + example()[5:], Reject.VERSION),
         (example()[:7] + b"\4" + example()[8:], Reject.DIMENSION),
         (example()[:7] + b"\2" + example()[8:], Reject.LENGTH),
         (example()[:-1] + bytes([example()[-1] ^ 1]), Reject.CHECKSUM),
-        (resealed(example()[:72] + struct.pack("<d", np.nan) + example()[80:]), Reject.NON_FINITE),
+        (resealed(example()[:80] + struct.pack("<d", np.nan) + example()[88:]), Reject.NON_FINITE),
         (
             resealed(example()[:136] + struct.pack("<d", np.inf) + example()[144:]),
             Reject.NON_FINITE,
