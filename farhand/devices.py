@@ -134,7 +134,9 @@ def device_check(
                 pushes = TorqueTest(
                     device,
                     robot,
-                    Guard(limits_of(own.limits, robot.joints, robot.task_dimension)),
+                    Guard(
+                        limits_of(own.limits, robot, device.joint_stops), loaded.period_ns * 1e-9
+                    ),
                     clock,
                     loaded.period_ns,
                     torque_nm=test_torque_nm,

@@ -8,7 +8,6 @@ import numpy.typing as npt
 from control_law.control import control_torque
 from control_law.coupling import Coupling
 from control_law.damping import Damping
-from control_law.ramp import smooth_ramp
 from hardware.robot_model import RobotTerms
 from site_runtime.controller import Command
 
@@ -17,16 +16,16 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class LocalController:
-    """nP+D with gravity compensation; Ω ramps in over `ramp_s` [s]."""
+    """nP+D with gravity compensation."""
 
     coupling: Coupling
     damping: Damping
-    ramp_s: float
 
-    def step(self, terms: RobotTerms, peer_position_m: FloatArray, engaged_s: float) -> Command:
+    def step(
+        self, terms: RobotTerms, peer_position_m: FloatArray, force_share: float, engaged_s: float
+    ) -> Command:
         """Return the torque toward the remote robot's delayed position (z,) [m]."""
-        share, _ = smooth_ramp(engaged_s, self.ramp_s)
-        force = share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_l)
+        force = force_share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_l)
         zeta = np.zeros_like(terms.q)
         torque, _ = control_torque(terms, force, self.damping, zeta, zeta)
         return Command(torque, -force)

@@ -18,7 +18,6 @@ def build_local_site(session: Session, surroundings: Surroundings) -> Site:
         LocalController(
             coupling=coupling_of(session.coupling),
             damping=damping_of(session.local.damping),
-            ramp_s=session.engagement.ramp_s,
         ),
         build_operator(session.local.operator, session.task.dimension),
     )

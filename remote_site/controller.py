@@ -20,19 +20,19 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class RemoteController:
-    """nP+D with gravity compensation; Ω and the sub-task ramp in after engagement [s]."""
+    """nP+D with gravity compensation; the sub-task ramps in after engagement [s]."""
 
     coupling: Coupling
     damping: Damping
-    ramp_s: float
     sub_task: SubTask | None
     sub_task_ramp_s: float
     regularisation: float
 
-    def step(self, terms: RobotTerms, peer_position_m: FloatArray, engaged_s: float) -> Command:
+    def step(
+        self, terms: RobotTerms, peer_position_m: FloatArray, force_share: float, engaged_s: float
+    ) -> Command:
         """Return the torque toward the local robot's delayed position (z,) [m]."""
-        share, _ = smooth_ramp(engaged_s, self.ramp_s)
-        force = share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_r)
+        force = force_share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_r)
         zeta, zeta_dot = self.reference(terms, engaged_s)
         torque, s = control_torque(terms, force, self.damping, zeta, zeta_dot)  # (6)
         error = project(terms.J, s, self.regularisation) if self.sub_task is not None else None

@@ -15,7 +15,6 @@ def build_remote_controller(session: Session) -> RemoteController:
     return RemoteController(
         coupling=coupling_of(session.coupling),
         damping=damping_of(session.remote.damping),
-        ramp_s=session.engagement.ramp_s,
         sub_task=build_sub_task(session.remote, robot_of(session, SiteId.REMOTE)),
         sub_task_ramp_s=session.engagement.sub_task_ramp_s,
         regularisation=session.remote.null_space.regularisation,

@@ -1,7 +1,8 @@
 """From a session file to a site: the same parts for a daemon and for simulation."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 
@@ -10,15 +11,16 @@ from channel.link import Link
 from hardware.interface import ContactForce, Device, DeviceConfigurationError
 from hardware.registry import DeviceContext, driver, force_sensor
 from hardware.sensed import SensedDevice
-from site_runtime.certification import certify
 from site_runtime.clock import Clock
 from site_runtime.controller import Controller
 from site_runtime.guard import Guard
 from site_runtime.keys import SiteId
+from site_runtime.margin import margin_of
+from site_runtime.operator_requests import OperatorRequests
 from site_runtime.parts import limits_of, robot_of
 from site_runtime.session import LocalSettings, RemoteSettings, Session
 from site_runtime.site import Site, SiteTimes
-from site_runtime.supervisor import EngagementTimes, Supervisor
+from site_runtime.supervisor import EngagementRules, Supervisor
 from telemetry.stream import TelemetryStream
 
 
@@ -28,7 +30,7 @@ class Surroundings:
 
     Session time is zero at `session_start_ns` on its clock; `epoch` names this run and differs
     from every other; `publish` takes telemetry and must not block; `shared_clock` says that both
-    sites read one clock.
+    sites read one clock; `requests` are those of this site's operator.
     """
 
     link: Link
@@ -37,6 +39,7 @@ class Surroundings:
     epoch: int
     publish: Callable[[bytes], None]
     shared_clock: bool = False
+    requests: OperatorRequests = field(default_factory=OperatorRequests)
 
 
 def device_of(settings: LocalSettings | RemoteSettings, context: DeviceContext) -> Device:
@@ -76,9 +79,10 @@ def assemble(
     robot = robot_of(session, identity)
     n, z = robot.joints, robot.task_dimension
     context = DeviceContext(robot, contact, clock.now_ns, start_ns, 2 * session.seed + identity)
+    device = device_of(own, context)
     return Site(
         identity,
-        device=device_of(own, context),
+        device=device,
         robot=robot,
         channel=Channel(
             surroundings.link,
@@ -95,13 +99,37 @@ def assemble(
             shared_clock=surroundings.shared_clock,
         ),
         controller=controller,
-        supervisor=Supervisor(EngagementTimes(start_ns, hold_after_ns, session.engagement.blend_s)),
-        guard=Guard(limits_of(own.limits, n, z)),
+        supervisor=Supervisor(engagement_rules(session, identity, start_ns), z),
+        margin=margin_of(session),
+        guard=Guard(limits_of(own.limits, robot, device.joint_stops), session.period_ns * 1e-9),
         telemetry=TelemetryStream(
             n, z, identity, session.digest, surroundings.epoch, surroundings.publish
         ),
         clock=clock,
-        times=SiteTimes(session.period_ns, session.send_period_ns, start_ns),
-        certified_round_trip_s=certify(session).best.round_trip_s,
+        times=SiteTimes(
+            session.period_ns,
+            session.send_period_ns,
+            start_ns,
+            session.loop.late_ticks_to_hold,
+            session.loop.late_ticks_to_fault,
+        ),
+        requests=surroundings.requests,
         obstacles_m=tuple(np.array(obstacle.center_m) for obstacle in obstacles),
+    )
+
+
+def engagement_rules(session: Session, identity: SiteId, not_before_ns: int) -> EngagementRules:
+    """Return when and how one site of a session engages, on its clock."""
+    engagement = session.engagement
+    return EngagementRules(
+        not_before_ns=not_before_ns,
+        hold_after_ns=round(engagement.hold_after_s * 1e9),
+        stop_after_ns=round(engagement.stop_after_s * 1e9),
+        ramp_s=engagement.ramp_s,
+        release_s=engagement.release_s,
+        blend_s=engagement.blend_s,
+        align_within_m=inf if engagement.alignment == "none" else engagement.align_within_m,
+        derate_to=engagement.derate_to,
+        leads=identity is SiteId.LOCAL,
+        clutched=engagement.alignment == "clutch",
     )

@@ -27,6 +27,11 @@ class Command:
 class Controller(Protocol):
     """The paper's law at one site; pure but for its constants."""
 
-    def step(self, terms: RobotTerms, peer_position_m: FloatArray, engaged_s: float) -> Command:
-        """Return the command at (q, q̇) toward the peer's point, `engaged_s` after engagement."""
+    def step(
+        self, terms: RobotTerms, peer_position_m: FloatArray, force_share: float, engaged_s: float
+    ) -> Command:
+        """Return the command at (q, q̇) toward the peer's point, `engaged_s` after engagement.
+
+        `force_share`, 0 to 1, scales ΩP.
+        """
         ...

@@ -18,10 +18,12 @@ from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
 from site_runtime.clock import SteadyClock
 from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, RealTimeReport, apply_real_time
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
 from site_runtime.status import StatusLine, summary
+from site_runtime.terminal_keys import HELP, TerminalKeys
 
 SessionPath: TypeAlias = Annotated[
     Path, typer.Argument(metavar="SESSION.toml", help="The session file; the same at both sites.")
@@ -46,6 +48,8 @@ Quiet: TypeAlias = Annotated[
 
 # Ctrl-C, a service manager, a terminal or a login that is lost
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+EMERGENCY_STOP_SIGNAL = signal.SIGUSR1
+RESET_SIGNAL = signal.SIGUSR2
 
 EXIT_FAULT = 1
 EXIT_NOT_STARTED = 2
@@ -100,6 +104,7 @@ def run_daemon(
     try:
         session = load_session(session_path)
         clock = SteadyClock()
+        requests = OperatorRequests()
         with closing(_node(session, identity, options)) as node:
             surroundings = Surroundings(
                 link=node.link(
@@ -109,17 +114,21 @@ def run_daemon(
                 session_start_ns=clock.now_ns(),
                 epoch=time.time_ns(),
                 publish=node.publisher(telemetry_key(session.name, identity)),
+                requests=requests,
             )
             site = build(session, surroundings)
             _greet(console, session, site)
             cpus = session.real_time
             cpu = cpus.local_cpu if identity is SiteId.LOCAL else cpus.remote_cpu
             with (
-                StopSignals(clock, options.duration_s) as signals,
+                StopSignals(clock, options.duration_s, requests) as signals,
+                TerminalKeys(requests) as keys,
                 StatusLine(site, quiet=options.quiet),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 _report(console, real_time)
+                if keys.listening and not options.quiet:
+                    console.print(HELP, highlight=False)
                 site.run(signals.asked_to_stop)
             summary(site, Console())
     except (SessionError, LinkError, HardwareError, RealTimeError) as error:
@@ -145,10 +154,19 @@ def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNo
 
 
 class StopSignals:
-    """Signals and the duration end the loop between two ticks, never inside one."""
+    """Signals and the duration end the loop between two ticks, never inside one.
 
-    def __init__(self, clock: SteadyClock, duration_s: float | None) -> None:
+    SIGUSR1 is the emergency stop, SIGUSR2 the reset, where there are `requests` to take them.
+    """
+
+    def __init__(
+        self,
+        clock: SteadyClock,
+        duration_s: float | None,
+        requests: OperatorRequests | None = None,
+    ) -> None:
         self._clock = clock
+        self._requests = requests
         self._asked = False
         self._end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * 1e9)
         self._before: dict[int, object] = {}
@@ -162,6 +180,11 @@ class StopSignals:
             if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
                 continue  # started under nohup, to outlive its terminal
             self._before[number] = signal.signal(number, self._ask)
+        if (requests := self._requests) is not None:
+            self._before[EMERGENCY_STOP_SIGNAL] = signal.signal(
+                EMERGENCY_STOP_SIGNAL, lambda *_: requests.stop()
+            )
+            self._before[RESET_SIGNAL] = signal.signal(RESET_SIGNAL, lambda *_: requests.reset())
         return self
 
     def __exit__(
@@ -181,7 +204,7 @@ def _greet(console: Console, session: Session, site: Site) -> None:
     console.print(
         f"[bold]farhand[/bold] {site.identity.label} site · session {session.name} "
         f"({session.digest:016x}) · {session.loop.rate_hz} Hz · certified round trip "
-        f"{site.certified_round_trip_s * 1e3:.0f} ms",
+        f"{site.margin.certified_s * 1e3:.0f} ms",
         highlight=False,
     )
 

@@ -200,4 +200,4 @@ class TorqueTest:
         torque_nm = -(terms.M @ terms.q_dot) / BRAKE_S
         torque_nm[joint] += share * self._torque_nm[joint]
         torque_nm = terms.G + np.clip(torque_nm, -self._torque_nm, self._torque_nm)
-        self._device.write(self._guard.torque(torque_nm, terms.q_dot, terms.G))
+        self._device.write(self._guard.torque(torque_nm, terms))

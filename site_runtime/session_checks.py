@@ -64,6 +64,19 @@ def _rates(file: SessionFile) -> Iterator[Problem]:
             f"must be at least three times the {spacing_s:g} s between packets, "
             "else every lost packet is a silent peer",
         )
+    engagement, loop = file.engagement, file.loop
+    if engagement.stop_after_s < engagement.release_s:
+        yield Problem(
+            "engagement.stop_after_s",
+            engagement.stop_after_s,
+            f"must be at least release_s = {engagement.release_s}, in which the force goes",
+        )
+    if loop.late_ticks_to_fault < loop.late_ticks_to_hold:
+        yield Problem(
+            "loop.late_ticks_to_fault",
+            loop.late_ticks_to_fault,
+            f"must be at least late_ticks_to_hold = {loop.late_ticks_to_hold}",
+        )
 
 
 def _joints(robot: RobotDescription) -> int:
@@ -94,8 +107,15 @@ def _site(
         f"{name}.device", site.device, ("initial_position_rad",), joints, per_joint
     )
     yield from _same_length(
-        f"{name}.limits", limits, ("torque_nm", "velocity_rad_s"), joints, per_joint
+        f"{name}.limits",
+        limits,
+        ("torque_nm", "torque_rate_nm_s", "velocity_rad_s"),
+        joints,
+        per_joint,
     )
+    stops = ("joint_min_rad", "joint_max_rad")
+    yield from _same_length(f"{name}.limits", limits, stops, joints, per_joint)
+    yield from _ordered(f"{name}.limits", limits, *stops)
     box = ("workspace_min_m", "workspace_max_m")
     yield from _same_length(f"{name}.limits", limits, box, dimension, per_axis)
     yield from _ordered(f"{name}.limits", limits, *box)

@@ -44,9 +44,11 @@ Locator = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """The control loop of both sites."""
+    """The control loop of both sites, and how many late ticks in a row lead where."""
 
     rate_hz: Annotated[int, Field(ge=10, le=MOST_HZ)] = 1000
+    late_ticks_to_hold: Annotated[int, Field(ge=1)] = 20
+    late_ticks_to_fault: Annotated[int, Field(ge=1)] = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +81,18 @@ CouplingSettings = StiffnessCoupling | PaperCoupling
 
 @dataclass(frozen=True, slots=True)
 class EngagementSettings:
-    """How force comes in, and what a silent peer leads to."""
+    """How the sites come together, how force comes in and goes, and what silence leads to."""
 
+    alignment: Literal["clutch", "check", "none"] = "clutch"
+    align_within_m: Positive = 0.02
     ramp_s: NonNegative = 2.0
     sub_task_ramp_s: NonNegative = 0.5
+    release_s: NonNegative = 0.2
     hold_after_s: Positive = 0.1
+    stop_after_s: Positive = 30.0
     blend_s: NonNegative = 1.0
+    beyond_certificate: Literal["derate", "warn"] = "derate"
+    derate_to: Annotated[float, Field(gt=0, le=1)] = 0.25
 
 
 def _no_delay() -> Direction:
@@ -125,9 +133,14 @@ class LimitSettings:
     """What the guard enforces; None is no limit."""
 
     torque_nm: tuple[Positive, ...] | None = None
+    torque_rate_nm_s: tuple[Positive, ...] | None = None
     velocity_rad_s: tuple[Positive, ...] | None = None
+    kinetic_energy_j: Positive | None = None
+    joint_min_rad: tuple[float, ...] | None = None
+    joint_max_rad: tuple[float, ...] | None = None
     workspace_min_m: tuple[float, ...] | None = None
     workspace_max_m: tuple[float, ...] | None = None
+    fault_after_s: Positive = 1.0
 
 
 def _device(table: object) -> DeviceSettings:

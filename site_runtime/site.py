@@ -17,7 +17,9 @@ from site_runtime.clock import Clock, LatenessHistogram, Pacer
 from site_runtime.controller import Command, Controller
 from site_runtime.guard import Guard
 from site_runtime.keys import SiteId
-from site_runtime.supervisor import DRIVEN, State, Supervisor
+from site_runtime.margin import Margin
+from site_runtime.operator_requests import OperatorRequests
+from site_runtime.supervisor import DRIVEN, STOPPED, Cause, State, Supervisor
 from telemetry.rows import NO_PEER_STATE
 from telemetry.stream import TelemetryStream
 
@@ -27,18 +29,27 @@ _FAREWELL_PACKETS = 5
 
 @dataclass(frozen=True, slots=True)
 class SiteTimes:
-    """Tick period, time between packets, session time zero on the site's clock [ns]."""
+    """Tick period, time between packets, session time zero on the site's clock [ns].
+
+    So many late ticks in a row, each by more than a period, lead to HOLD and to FAULT.
+    """
 
     period_ns: int
     send_period_ns: int
     session_start_ns: int
+    late_ticks_to_hold: int
+    late_ticks_to_fault: int
+
+
+class LateError(Exception):
+    """The loop does not keep its rate any more: the site goes to FAULT."""
 
 
 class Site:
     """Device, channel, controller, supervisor and guard of one side of the teleoperation.
 
     The same object runs in a daemon on a steady clock and in simulation on a manual one.
-    `certified_round_trip_s` is what the gains are proven for; `obstacles_m`, centres (z,) each.
+    `obstacles_m` are centres (z,) each.
     """
 
     def __init__(
@@ -50,19 +61,21 @@ class Site:
         channel: Channel,
         controller: Controller,
         supervisor: Supervisor,
+        margin: Margin,
         guard: Guard,
         telemetry: TelemetryStream,
         clock: Clock,
         times: SiteTimes,
-        certified_round_trip_s: float,
+        requests: OperatorRequests,
         obstacles_m: tuple[FloatArray, ...],
     ) -> None:
         self.identity = identity
         self.channel = channel
         self.guard = guard
+        self.margin = margin
+        self.requests = requests
         self.telemetry = telemetry
         self.lateness = LatenessHistogram()
-        self.certified_round_trip_s = certified_round_trip_s
         self.failure: Exception | None = None
         self.ticks = 0
         self.missed = 0
@@ -77,12 +90,23 @@ class Site:
         self._obstacles_m = obstacles_m
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
+        self._late_ticks = 0
         self._position_m = np.zeros(robot.task_dimension)
 
     @property
     def state(self) -> State:
         """The supervisor's state."""
         return self._supervisor.state
+
+    @property
+    def cause(self) -> Cause:
+        """Why it is in that state."""
+        return self._supervisor.cause
+
+    @property
+    def apart_m(self) -> float:
+        """How far apart the robots' points were when last compared [m]."""
+        return self._supervisor.apart_m
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Tick at absolute deadlines until told to stop; the robot is stopped however it ends."""
@@ -105,27 +129,32 @@ class Site:
     def tick(self, lateness_ns: int = 0) -> None:
         """One tick. Whatever goes wrong ends in the device's stop, which never raises."""
         now_ns = self._clock.now_ns()
-        if self.failure is not None:
-            self._tick_in_fault(now_ns, lateness_ns)
+        if self._supervisor.state in STOPPED:
+            self._tick_stopped(now_ns, lateness_ns)
             return
         try:
             reading = self._device.read()
             self.guard.reading(reading)
             peer = self.channel.latest(now_ns)
             terms = self._robot.terms(reading.position_rad, reading.velocity_rad_s)
-            state, command, torque_nm = self._supervise(now_ns, peer), self._idle, None
+            state = self._supervise(now_ns, lateness_ns, peer, terms, reading.clutch)
+            command, torque_nm, share = self._idle, None, 0.0
             if state in DRIVEN and self._supervisor.target_m is not None:
                 target_m = self.guard.target(self._supervisor.target_m)
-                command = self._controller.step(terms, target_m, self._supervisor.engaged_s(now_ns))
-                torque_nm = self.guard.torque(command.torque_nm, terms.q_dot, terms.G)
+                share = self._supervisor.force_share(now_ns)
+                engaged_s = self._supervisor.engaged_s(now_ns)
+                command = self._controller.step(terms, target_m, share, engaged_s)
+                torque_nm = self.guard.torque(command.torque_nm, terms)
                 self._device.write(torque_nm)
             force_n = reading.wrench[: self._robot.task_dimension]
-            self.channel.send(now_ns, state, terms.X, terms.X_dot, force_n)
-            self._put(now_ns, lateness_ns, reading, peer, terms, command, torque_nm)
+            told_m = self._supervisor.told_m(terms.X)
+            self.channel.send(now_ns, state, told_m, terms.X_dot, force_n)
+            self._put(now_ns, lateness_ns, reading, peer, terms, command, torque_nm, share)
         except Exception as failure:
             self._device.stop()
             self._supervisor.fault()
             self.failure = failure
+            self.telemetry.event(now_ns, f"FAULT: {type(failure).__name__}: {failure}")
         self.ticks += 1
         self._duration_ns = self._clock.now_ns() - now_ns
 
@@ -140,16 +169,40 @@ class Site:
         finally:
             self._device.close()
 
-    def _supervise(self, now_ns: int, peer: PeerSample | None) -> State:
-        """Update the supervisor; switch the outputs on when it first engages."""
-        before = self._supervisor.state
-        state = self._supervisor.update(now_ns, self.channel, peer)
-        if state in DRIVEN and before not in DRIVEN:
-            self._device.enable()
+    def _supervise(
+        self,
+        now_ns: int,
+        lateness_ns: int,
+        peer: PeerSample | None,
+        terms: RobotTerms,
+        clutch_button: bool,
+    ) -> State:
+        """Update the supervisor; switch the outputs on and off with its state."""
+        times, supervisor, before = self._times, self._supervisor, self._supervisor.state
+        self._late_ticks = self._late_ticks + 1 if lateness_ns > times.period_ns else 0
+        if self._late_ticks >= times.late_ticks_to_fault:
+            raise LateError(f"{self._late_ticks} ticks in a row came late: the loop is too slow")
+        state = supervisor.update(
+            now_ns,
+            self.channel,
+            peer,
+            terms.X,
+            scale=self.margin.share(self.channel.loop_bound_ns),
+            late=self._late_ticks >= times.late_ticks_to_hold,
+            clutch=clutch_button or self.requests.clutch,
+            emergency_stop=self.requests.take_emergency_stop(),
+        )
+        if state is not before:
+            if state in DRIVEN and before not in DRIVEN:
+                self.guard.restart()
+                self._device.enable()
+            elif before in DRIVEN and state not in DRIVEN:
+                self._device.stop()
+            self.telemetry.event(now_ns, f"{state.name}: {supervisor.cause.value}")
         return state
 
-    def _tick_in_fault(self, now_ns: int, lateness_ns: int) -> None:
-        """Keep telling the peer and people that this site has failed; the device is stopped."""
+    def _tick_stopped(self, now_ns: int, lateness_ns: int) -> None:
+        """Tell the peer and people that the device is stopped, and wait for a reset."""
         with suppress(Exception):  # the link may be what failed; the first failure is the one told
             self.channel.latest(now_ns)
             self._say(now_ns)
@@ -160,6 +213,22 @@ class Site:
             state=self._supervisor.state,
         )
         self.ticks += 1
+        if self.requests.take_reset():
+            self._reset(now_ns)
+
+    def _reset(self, now_ns: int) -> None:
+        """Open the device anew, outputs off; it may take its time. A fault again if it fails."""
+        self._device.close()
+        try:
+            self._device.open()
+        except Exception as failure:
+            self.failure = failure
+            self.telemetry.event(now_ns, f"FAULT: {type(failure).__name__}: {failure}")
+            return
+        self.failure = None
+        self._late_ticks = 0
+        self._supervisor.reset()
+        self.telemetry.event(now_ns, "READY: " + self._supervisor.cause.value)
 
     def _say(self, now_ns: int) -> None:
         rest = np.zeros(self._robot.task_dimension)
@@ -174,6 +243,7 @@ class Site:
         terms: RobotTerms,
         command: Command,
         torque_nm: FloatArray | None,
+        share: float,
     ) -> None:
         """Write this tick's row."""
         self._position_m = terms.X
@@ -199,9 +269,12 @@ class Site:
             external_force_n=reading.wrench[: self._robot.task_dimension],
             coupling_force_n=command.coupling_force_n,
             peer_position_m=nan if target_m is None else target_m,
+            offset_m=self._supervisor.offset_m,
+            force_share=share,
             one_way_delay_s=nan if peer is None else peer.age_ns * 1e-9,
             round_trip_s=self.round_trip_s,
-            certified_round_trip_s=self.certified_round_trip_s,
+            loop_bound_s=self.margin.loop_s,
+            certified_round_trip_s=self.margin.certified_s,
             manipulability=manipulability(terms.J),
             link_distance_m=self._nearest(segment_distance, terms.origins),
             midpoint_distance_m=self._nearest(midpoint_distance, terms.origins),

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from channel.packet import Reject
-from site_runtime.guard import Cut
+from site_runtime.guard import cut_names
 from site_runtime.site import Site
 from site_runtime.supervisor import State
 
@@ -62,15 +62,20 @@ class StatusLine:
 def describe(site: Site, rate_hz: float) -> str:
     """One line: state, rate, round trip, margin to the certified one, position error."""
     round_trip_ms = site.round_trip_s * 1e3
-    margin_ms = (site.certified_round_trip_s - site.round_trip_s) * 1e3
+    margin_ms = (site.margin.certified_s - site.margin.loop_s) * 1e3
     parts = [f"{site.identity.label:6} {site.state.name:8} {rate_hz:6.0f} Hz"]
-    if not site.channel.peer_present:
-        parts.append("no peer")
+    if site.state is not State.ENGAGED:
+        parts.append(site.cause.value)
+    if site.state is State.ALIGNING:
+        parts.append(f"{site.apart_m * 1e3:.0f} mm")
     if not isnan(round_trip_ms):
         parts.append(f"round trip {round_trip_ms:6.1f} ms")
+    if not isnan(margin_ms):
         parts.append(f"margin {margin_ms:6.1f} ms")
     if not isnan(site.error_m):
         parts.append(f"error {site.error_m * 1e3:6.1f} mm")
+    if site.channel.peer_taken:
+        parts.append("the peer obeys ANOTHER site than this one")
     if site.channel.session_mismatch:
         parts.append("the peer has ANOTHER session file")
     if site.failure is not None:
@@ -103,12 +108,9 @@ def summary(site: Site, console: Console) -> None:
     cuts = {cut: count for cut, count in site.guard.counts.items() if count}
     if cuts:
         table.add_row(
-            "guard cut", ", ".join(f"{_CUT_NAMES[cut]} in {n} ticks" for cut, n in cuts.items())
+            "guard cut", ", ".join(f"{cut_names(cut)} in {n} ticks" for cut, n in cuts.items())
         )
     if site.state is State.FAULT and site.failure is not None:
         failure = f"{type(site.failure).__name__}: {site.failure}"
         table.add_row("FAULT", Text(failure, style="red"))  # no markup: vectors have brackets
     console.print(table)
-
-
-_CUT_NAMES = {Cut.TORQUE: "torque", Cut.VELOCITY: "velocity", Cut.WORKSPACE: "workspace"}

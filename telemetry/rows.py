@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 RowArray: TypeAlias = npt.NDArray[np.void]
 
-LAYOUT_VERSION: Final = 1
+LAYOUT_VERSION: Final = 2
 """Raised whenever a field of `COLUMNS` is added, removed, moved or changes its meaning."""
 
 NO_PEER_STATE: Final = 255
@@ -52,13 +52,20 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         ),
         "coupling_force_n": Column("<f8", "task", "N", "Force −ΩP(e) of the coupling on the robot"),
         "peer_position_m": Column(
-            "<f8", "task", "m", "Delayed position of the peer in use; NaN: none"
+            "<f8", "task", "m", "Point to follow: the peer's, delayed, plus the offset; NaN: none"
+        ),
+        "offset_m": Column("<f8", "task", "m", "What the clutch put between the robots' points"),
+        "force_share": Column(
+            "<f8", "scalar", "1", "Share of stiffness and force ceiling in force: ramp, de-rating"
         ),
         "one_way_delay_s": Column(
             "<f8", "scalar", "s", "Age of the peer sample in use, from the clock offset; NaN: none"
         ),
         "round_trip_s": Column(
             "<f8", "scalar", "s", "Age of the whole loop, measured on one clock; NaN: none"
+        ),
+        "loop_bound_s": Column(
+            "<f8", "scalar", "s", "Greatest ages of late, both sites' together; NaN: none"
         ),
         "certified_round_trip_s": Column(
             "<f8", "scalar", "s", "Round trip the gains in use are proven stable for"

@@ -87,8 +87,11 @@ class TelemetryStream:
         self._external_force_n = ring["external_force_n"]
         self._coupling_force_n = ring["coupling_force_n"]
         self._peer_position_m = ring["peer_position_m"]
+        self._offset_m = ring["offset_m"]
+        self._force_share = ring["force_share"]
         self._one_way_delay_s = ring["one_way_delay_s"]
         self._round_trip_s = ring["round_trip_s"]
+        self._loop_bound_s = ring["loop_bound_s"]
         self._certified_round_trip_s = ring["certified_round_trip_s"]
         self._manipulability = ring["manipulability"]
         self._link_distance_m = ring["link_distance_m"]
@@ -127,8 +130,11 @@ class TelemetryStream:
         external_force_n: FloatArray,
         coupling_force_n: FloatArray,
         peer_position_m: FloatArray | float,
+        offset_m: FloatArray,
+        force_share: float,
         one_way_delay_s: float,
         round_trip_s: float,
+        loop_bound_s: float,
         certified_round_trip_s: float,
         manipulability: float,
         link_distance_m: float,
@@ -161,8 +167,11 @@ class TelemetryStream:
         self._external_force_n[i] = external_force_n
         self._coupling_force_n[i] = coupling_force_n
         self._peer_position_m[i] = peer_position_m
+        self._offset_m[i] = offset_m
+        self._force_share[i] = force_share
         self._one_way_delay_s[i] = one_way_delay_s
         self._round_trip_s[i] = round_trip_s
+        self._loop_bound_s[i] = loop_bound_s
         self._certified_round_trip_s[i] = certified_round_trip_s
         self._manipulability[i] = manipulability
         self._link_distance_m[i] = link_distance_m
@@ -192,7 +201,11 @@ class TelemetryStream:
         self._cut[i] = 0
         self._torque_nm[i] = 0.0
         self._coupling_force_n[i] = 0.0
+        self._force_share[i] = 0.0
         self._count += 1
+
+    def event(self, stamp_ns: int, text: str) -> None:
+        """Note what happened; real-time safe."""
 
     def flush(self) -> None:
         """Publish every full batch not yet published; nothing to do in most ticks."""
