@@ -3,13 +3,11 @@ import pytest
 
 from control_law.coupling import Coupling
 from control_law.damping import Damping
-from control_law.ramp import smooth_ramp
 from hardware.robot_model import PlanarArm, RobotModel, build_robot
 from local_site.controller import LocalController
 
 STIFFNESS, CEILING = np.array([200.0, 100.0]), np.array([15.0, 5.0])
 JOINT, TASK = np.array([0.3, 0.1]), np.array([30.0, 20.0])
-RAMP_S = 2.0
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +19,7 @@ def robot() -> RobotModel:
 @pytest.fixture
 def controller() -> LocalController:
     coupling = Coupling.from_stiffness(STIFFNESS, CEILING)
-    return LocalController(coupling, Damping(JOINT, TASK), RAMP_S)
+    return LocalController(coupling, Damping(JOINT, TASK))
 
 
 def spring_n(error_m: np.ndarray) -> np.ndarray:
@@ -37,7 +35,7 @@ def test_the_torque_is_gravity_minus_spring_minus_damping(
     rng = np.random.default_rng(seed)
     q, q_dot = rng.uniform(-2, 2, 2), rng.uniform(-3, 3, 2)
     terms, peer = robot.terms(q, q_dot), rng.uniform(-0.6, 0.6, 2)
-    command = controller.step(terms, peer, engaged_s=10.0)
+    command = controller.step(terms, peer, force_share=1.0, engaged_s=10.0)
     force = spring_n(terms.X - peer)
     Lambda = np.diag(JOINT) + terms.J.T @ np.diag(TASK) @ terms.J
     expected = terms.G - terms.J.T @ force - Lambda @ q_dot
@@ -48,7 +46,9 @@ def test_the_torque_is_gravity_minus_spring_minus_damping(
 
 def test_the_spring_pulls_toward_the_peer(robot: RobotModel, controller: LocalController) -> None:
     terms = robot.terms(np.array([0.3, 1.2]), np.zeros(2))
-    command = controller.step(terms, terms.X + np.array([0.01, -0.02]), engaged_s=10.0)
+    command = controller.step(
+        terms, terms.X + np.array([0.01, -0.02]), force_share=1.0, engaged_s=10.0
+    )
     assert command.coupling_force_n[0] > 0.0 > command.coupling_force_n[1]
     pushed = robot.forward_dynamics(terms.q, terms.q_dot, command.torque_nm)
     assert (terms.J @ pushed) @ command.coupling_force_n > 0.0
@@ -58,18 +58,17 @@ def test_at_the_peers_point_and_at_rest_only_gravity_is_carried(
     robot: RobotModel, controller: LocalController
 ) -> None:
     terms = robot.terms(np.array([0.3, 1.2]), np.zeros(2))
-    assert np.array_equal(controller.step(terms, terms.X, 5.0).torque_nm, terms.G)
+    assert np.array_equal(controller.step(terms, terms.X, 1.0, 5.0).torque_nm, terms.G)
 
 
-@pytest.mark.parametrize("engaged_s", [0.0, 0.5, 1.0, 2.0])
-def test_the_spring_comes_in_smoothly_and_damping_is_there_from_the_start(
-    robot: RobotModel, controller: LocalController, engaged_s: float
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_the_share_scales_the_spring_and_leaves_damping_and_gravity(
+    robot: RobotModel, controller: LocalController, share: float
 ) -> None:
     terms = robot.terms(np.array([0.3, 1.2]), np.array([0.5, -0.4]))
     peer = terms.X + 0.3
-    full = controller.step(terms, peer, 100.0)
-    command = controller.step(terms, peer, engaged_s)
-    share, _ = smooth_ramp(engaged_s, RAMP_S)
+    full = controller.step(terms, peer, 1.0, 100.0)
+    command = controller.step(terms, peer, share, 0.1)
     assert np.allclose(command.coupling_force_n, share * full.coupling_force_n)
     rest = command.torque_nm - terms.J.T @ command.coupling_force_n
     assert np.allclose(rest, full.torque_nm - terms.J.T @ full.coupling_force_n)
@@ -80,6 +79,6 @@ def test_no_error_pulls_harder_than_the_ceiling(
 ) -> None:
     terms = robot.terms(np.array([0.3, 1.2]), np.zeros(2))
     for distance_m in (1.0, 100.0, 1e9):
-        force = controller.step(terms, terms.X + distance_m, 100.0).coupling_force_n
+        force = controller.step(terms, terms.X + distance_m, 1.0, 100.0).coupling_force_n
         assert (force < CEILING).all()
     assert force == pytest.approx(CEILING)

@@ -23,7 +23,6 @@ def test_the_site_is_built_as_the_session_file_says() -> None:
     controller = site._controller
     assert site.identity is SiteId.LOCAL
     assert isinstance(controller, LocalController)
-    assert controller.ramp_s == session.engagement.ramp_s
     assert tuple(controller.damping.task) == session.local.damping.task_n_s_per_m
     assert tuple(controller.coupling.stiffness) == session.coupling.stiffness_n_per_m
     assert isinstance(site._device._contact, HumanArm)

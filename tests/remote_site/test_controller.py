@@ -37,7 +37,6 @@ def controller_of(sub_task: SubTask | None, regularisation: float = 1e-4) -> Rem
     return RemoteController(
         coupling=Coupling.from_stiffness(STIFFNESS, CEILING),
         damping=Damping(JOINT, TASK),
-        ramp_s=2.0,
         sub_task=sub_task,
         sub_task_ramp_s=0.5,
         regularisation=regularisation,
@@ -77,20 +76,19 @@ def pose(seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
 def test_the_closed_loop_is_that_of_the_paper(
     robot: RobotModel, name: str, engaged_s: float, seed: int
 ) -> None:
-    sub_task, regularisation = SUB_TASKS[name], 1e-4
+    sub_task, regularisation, share = SUB_TASKS[name], 1e-4, 0.3
     q, q_dot, peer = pose(seed)
     terms = robot.terms(q, q_dot)
-    command = controller_of(sub_task).step(terms, peer, engaged_s)
+    command = controller_of(sub_task).step(terms, peer, share, engaged_s)
     q_ddot = robot.forward_dynamics(q, q_dot, command.torque_nm)
 
     def zeta(h: float) -> FloatArray:
         ahead = robot.terms(q + h * q_dot + 0.5 * h * h * q_ddot, q_dot + h * q_ddot)
-        share, _ = smooth_ramp(engaged_s + h, 0.5)
-        return zeta_of(ahead, sub_task, regularisation, share)
+        ramp, _ = smooth_ramp(engaged_s + h, 0.5)
+        return zeta_of(ahead, sub_task, regularisation, ramp)
 
     h = 1e-5
     s, s_dot = q_dot - zeta(0.0), q_ddot - (zeta(h) - zeta(-h)) / (2 * h)
-    share, _ = smooth_ramp(engaged_s, 2.0)
     force = share * spring_n(terms.X - peer)
     residual = terms.M @ s_dot + terms.C @ s + damping_matrix(terms.J) @ s + terms.J.T @ force
     scale = np.abs(damping_matrix(terms.J) @ s).max()
@@ -102,7 +100,7 @@ def test_the_closed_loop_is_that_of_the_paper(
 def test_without_a_sub_task_it_is_the_local_law(robot: RobotModel, seed: int) -> None:
     q, q_dot, peer = pose(seed)
     terms = robot.terms(q, q_dot)
-    command = controller_of(None).step(terms, peer, LONG_S)
+    command = controller_of(None).step(terms, peer, 1.0, LONG_S)
     expected = terms.G - terms.J.T @ spring_n(terms.X - peer) - damping_matrix(terms.J) @ q_dot
     assert command.torque_nm == pytest.approx(expected, abs=1e-12)
     assert command.sub_task_error_rad_s == 0.0
@@ -118,7 +116,7 @@ def test_the_sub_task_does_not_move_the_end_effector(robot: RobotModel, seed: in
     assert np.abs(terms.X_dot).max() < 1e-12
     assert np.linalg.norm(zeta) > 0.01
     at_rest = replace(controller_of(sub_task), damping=Damping(JOINT, np.zeros(2)))
-    command = at_rest.step(terms, terms.X, LONG_S)  # s = 0, e = 0
+    command = at_rest.step(terms, terms.X, 1.0, LONG_S)  # s = 0, e = 0
     q_ddot = robot.forward_dynamics(q, zeta, command.torque_nm)
     assert np.abs(terms.J @ q_ddot + terms.J_dot @ zeta).max() < 1e-9
 
@@ -130,7 +128,7 @@ def test_the_sub_task_error_is_the_self_motion_not_yet_as_wished(
     q, q_dot, peer = pose(seed)
     sub_task = SUB_TASKS["manipulability"]
     terms = robot.terms(q, q_dot)
-    command = controller_of(sub_task, regularisation=0.0).step(terms, peer, LONG_S)
+    command = controller_of(sub_task, regularisation=0.0).step(terms, peer, 1.0, LONG_S)
     error = null_space(terms.J) @ (q_dot - sub_task.evaluate(terms)[0])  # (21)
     assert command.sub_task_error_rad_s == pytest.approx(np.linalg.norm(error), rel=1e-9)
 
@@ -138,15 +136,17 @@ def test_the_sub_task_error_is_the_self_motion_not_yet_as_wished(
 def test_the_sub_task_is_absent_at_engagement_and_ramped_in(robot: RobotModel) -> None:
     q, q_dot, peer = pose(0)
     terms = robot.terms(q, q_dot)
-    with_task = controller_of(SUB_TASKS["obstacle"]).step(terms, peer, 0.0)
-    without = controller_of(None).step(terms, peer, 0.0)
+    with_task = controller_of(SUB_TASKS["obstacle"]).step(terms, peer, 0.5, 0.0)
+    without = controller_of(None).step(terms, peer, 0.5, 0.0)
     assert with_task.torque_nm == pytest.approx(without.torque_nm, abs=1e-12)
-    later = controller_of(SUB_TASKS["obstacle"]).step(terms, peer, 0.25)
-    assert not np.allclose(later.torque_nm, controller_of(None).step(terms, peer, 0.25).torque_nm)
+    later = controller_of(SUB_TASKS["obstacle"]).step(terms, peer, 0.5, 0.25)
+    assert not np.allclose(
+        later.torque_nm, controller_of(None).step(terms, peer, 0.5, 0.25).torque_nm
+    )
 
 
 def test_a_singular_pose_is_passed_through(robot: RobotModel) -> None:
     terms = robot.terms(np.array([0.4, 0.0, 0.0]), np.array([0.1, 0.2, 0.3]))
-    command = controller_of(SUB_TASKS["manipulability"]).step(terms, np.zeros(2), LONG_S)
+    command = controller_of(SUB_TASKS["manipulability"]).step(terms, np.zeros(2), 1.0, LONG_S)
     assert np.isfinite(command.torque_nm).all()
     assert command.sub_task_error_rad_s == pytest.approx(0.0, abs=1e-9)

@@ -20,7 +20,6 @@ def test_the_site_is_built_as_the_session_file_says() -> None:
     controller = site._controller
     assert site.identity is SiteId.REMOTE
     assert isinstance(controller, RemoteController)
-    assert controller.ramp_s == session.engagement.ramp_s
     assert controller.sub_task_ramp_s == session.engagement.sub_task_ramp_s
     assert controller.regularisation == session.remote.null_space.regularisation
     assert isinstance(controller.sub_task, NormLimiter)

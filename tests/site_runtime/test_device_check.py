@@ -6,7 +6,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from hardware.interface import DeviceError, DeviceState, FloatArray
+from hardware.interface import DeviceError, DeviceState, FloatArray, JointStops
 from hardware.robot_model import PlanarArm, RobotModel, build_robot
 from hardware.simulated import SimulatedDevice, SimulatedSettings
 from site_runtime.clock import ManualClock
@@ -68,11 +68,20 @@ def make(clock: ManualClock) -> Callable[..., tuple[Wired, TorqueTest]]:
         device = Wired(ROBOT, clock, **imperfections)
         device.open()
         box = np.full(2, inf)
-        limits = Limits(np.full(2, torque_limit_nm), np.full(2, inf), -box, box)
+        limits = Limits(
+            torque_nm=np.full(2, torque_limit_nm),
+            torque_rate_nm_s=np.full(2, inf),
+            velocity_rad_s=np.full(2, inf),
+            kinetic_energy_j=inf,
+            workspace_min_m=-box,
+            workspace_max_m=box,
+            stops=JointStops.none(2),
+            fault_after_s=inf,
+        )
         test = TorqueTest(
             device,
             ROBOT,
-            Guard(limits),
+            Guard(limits, PERIOD_NS * 1e-9),
             clock,
             PERIOD_NS,
             torque_nm=TORQUE_NM,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import nan
+from math import inf, nan
 
 import numpy as np
 import numpy.typing as npt
@@ -10,21 +10,25 @@ import pytest
 
 from channel.channel import Channel, PeerSample
 from channel.memory_link import MemoryLink, memory_links
-from hardware.interface import DeviceError, DeviceState
+from hardware.interface import DeviceError, DeviceState, JointStops
 from hardware.robot_model import PlanarArm, RobotModel, RobotTerms, build_robot
 from site_runtime.clock import ManualClock
 from site_runtime.controller import Command
 from site_runtime.guard import Cut, Guard, GuardError, Limits
 from site_runtime.keys import SiteId
+from site_runtime.margin import Margin
+from site_runtime.operator_requests import OperatorRequests
 from site_runtime.site import Site, SiteTimes
-from site_runtime.supervisor import EngagementTimes, State, Supervisor
+from site_runtime.supervisor import EngagementRules, State, Supervisor
 from telemetry.rows import NO_PEER_STATE
 from telemetry.stream import TelemetryStream, decode_batch
 
 FloatArray = npt.NDArray[np.float64]
 MS = 1_000_000
 DIGEST, EPOCH, PEER_EPOCH = 11, 21, 22
-HOLD_AFTER = 20 * MS
+HOLD_AFTER, STOP_AFTER = 20 * MS, 200 * MS
+CERTIFIED_S = 0.4
+LATE_HOLD, LATE_FAULT = 5, 20
 Q = np.array([0.3, 0.8])
 
 
@@ -49,6 +53,8 @@ class FakeDevice:
     journal: Journal
     clock: ManualClock
     joints: int = 2
+    joint_stops: JointStops = field(default_factory=lambda: JointStops.none(2))
+    clutch: bool = False
     wrench: FloatArray = field(default_factory=lambda: np.arange(1.0, 7.0))
     velocity: FloatArray = field(default_factory=lambda: np.array([0.1, -0.2]))
     written: list[FloatArray] = field(default_factory=list)
@@ -61,7 +67,9 @@ class FakeDevice:
 
     def read(self) -> DeviceState:
         self.journal.note("read")
-        return DeviceState(Q.copy(), self.velocity.copy(), self.wrench.copy(), self.clock.now_ns())
+        return DeviceState(
+            Q.copy(), self.velocity.copy(), self.wrench.copy(), self.clock.now_ns(), self.clutch
+        )
 
     def write(self, torque_nm: FloatArray) -> None:
         self.journal.note("write")
@@ -90,22 +98,26 @@ class NotedController:
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
         self.asked: list[tuple[FloatArray, float]] = []
+        self.shares: list[float] = []
 
-    def step(self, terms: RobotTerms, peer_position_m: FloatArray, engaged_s: float) -> Command:
+    def step(
+        self, terms: RobotTerms, peer_position_m: FloatArray, force_share: float, engaged_s: float
+    ) -> Command:
         self._journal.note("controller")
         self.asked.append((peer_position_m.copy(), engaged_s))
-        force = peer_position_m - terms.X
+        self.shares.append(force_share)
+        force = force_share * (peer_position_m - terms.X)
         return Command(terms.J.T @ force, force, 0.25)
 
 
 class NotedGuard(Guard):
     def __init__(self, limits: Limits, journal: Journal) -> None:
-        super().__init__(limits)
+        super().__init__(limits, MS * 1e-9)
         self._journal = journal
 
-    def torque(self, *arguments: FloatArray) -> FloatArray:
+    def torque(self, torque_nm: FloatArray, terms: RobotTerms) -> FloatArray:
         self._journal.note("guard")
-        return super().torque(*arguments)
+        return super().torque(torque_nm, terms)
 
 
 class NotedChannel(Channel):
@@ -130,7 +142,7 @@ class NotedTelemetry(TelemetryStream):
 
 class Bench:
     def __init__(self, *, peer_digest: int = DIGEST, send_every: int = 1) -> None:
-        self.clock, self.journal = ManualClock(), Journal()
+        self.clock, self.journal, self.requests = ManualClock(), Journal(), OperatorRequests()
         self.published: list[bytes] = []
         mine, theirs = memory_links()
         self.peer_link: MemoryLink = theirs
@@ -142,19 +154,42 @@ class Bench:
         self.device = FakeDevice(self.journal, self.clock)
         self.controller = NotedController(self.journal)
         self.model = build_robot(PlanarArm("planar", (0.4, 0.3), (1.0, 1.0)), None)
-        limits = Limits(np.full(2, 5.0), np.full(2, 9.0), np.full(2, -1.0), np.full(2, 1.0))
+        limits = Limits(
+            torque_nm=np.full(2, 5.0),
+            torque_rate_nm_s=np.full(2, inf),
+            velocity_rad_s=np.full(2, 9.0),
+            kinetic_energy_j=inf,
+            workspace_min_m=np.full(2, -1.0),
+            workspace_max_m=np.full(2, 1.0),
+            stops=JointStops.none(2),
+            fault_after_s=0.05,
+        )
+        rules = EngagementRules(
+            not_before_ns=0,
+            hold_after_ns=HOLD_AFTER,
+            stop_after_ns=STOP_AFTER,
+            ramp_s=0.0,
+            release_s=0.01,
+            blend_s=0.01,
+            align_within_m=inf,
+            derate_to=0.25,
+            leads=True,
+            clutched=False,
+        )
+        relaxed = np.full(2, 0.5 * CERTIFIED_S + 1e-3)
         self.site = Site(
             SiteId.LOCAL,
             device=self.device,
             robot=NotedRobot(self.model, self.journal),  # type: ignore[arg-type]
             channel=channel,
             controller=self.controller,
-            supervisor=Supervisor(EngagementTimes(0, HOLD_AFTER, 0.01)),
+            supervisor=Supervisor(rules, 2),
+            margin=Margin(CERTIFIED_S, ((relaxed, relaxed),), MS, derate=True),
             guard=NotedGuard(limits, self.journal),
             telemetry=telemetry,
             clock=self.clock,
-            times=SiteTimes(MS, send_every * MS, 3 * MS),
-            certified_round_trip_s=0.4,
+            times=SiteTimes(MS, send_every * MS, 3 * MS, LATE_HOLD, LATE_FAULT),
+            requests=self.requests,
             obstacles_m=(np.array([0.0, 0.5]),),
         )
         self.site.open()
@@ -282,7 +317,7 @@ def test_the_row_tells_what_was_done(bench: Bench) -> None:
         np.linalg.norm(middles - [0.0, 0.5], axis=1).min()
     )
     assert row["link_distance_m"] <= row["midpoint_distance_m"]
-    assert row["certified_round_trip_s"] == 0.4
+    assert row["certified_round_trip_s"] == CERTIFIED_S
     assert row["round_trip_s"] == pytest.approx(1e-3)  # sent, used at the peer's next tick, back
     assert bench.site.error_m == pytest.approx(np.linalg.norm(bench.peer_position - terms.X))
 

@@ -48,7 +48,7 @@ def test_the_line_says_state_rate_round_trip_margin_and_error(site: Site) -> Non
     error = np.linalg.norm(row["position_m"] - row["peer_position_m"])
     assert line.startswith("local  OFFLINE     100 Hz")
     assert f"round trip {site.round_trip_s * 1e3:6.1f} ms" in line
-    assert f"margin {(site.certified_round_trip_s - site.round_trip_s) * 1e3:6.1f} ms" in line
+    assert f"margin {(site.margin.certified_s - site.margin.loop_s) * 1e3:6.1f} ms" in line
     assert f"error {error * 1e3:6.1f} mm" in line
 
 

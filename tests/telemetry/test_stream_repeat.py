@@ -4,7 +4,7 @@ from telemetry.rows import COLUMNS, row_dtype
 from telemetry.stream import RING_BATCHES, TelemetryStream, decode_batch
 
 CHANGED = {"sequence", "stamp_ns", "time_ns", "lateness_ns", "state"}
-OFF = {"cut", "torque_nm", "coupling_force_n"}
+OFF = {"cut", "torque_nm", "coupling_force_n", "force_share"}
 FAULT = 4
 
 
