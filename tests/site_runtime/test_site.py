@@ -259,6 +259,7 @@ def test_the_outputs_go_on_once_before_the_first_write(bench: Bench) -> None:
     assert calls.index("enable") < calls.index("controller") < calls.index("write")
     bench.tick(30, peer_speaks=False)
     assert bench.site.state is State.HOLD
+    bench.peer_state = State.ENGAGED
     bench.tick(3)
     assert bench.site.state is State.ENGAGED
     assert bench.journal.count("enable") == 1
@@ -366,6 +367,7 @@ def test_silence_holds_the_last_point_under_torque_and_the_end_of_it_resumes(ben
     assert bench.tick(peer_speaks=False) == DRIVING
     assert bench.site.state is State.HOLD
     assert np.array_equal(bench.controller.asked[-1][0], bench.peer_position)
+    bench.peer_state = State.ENGAGED
     assert bench.tick() == DRIVING
     assert bench.site.state is State.ENGAGED
 
