@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,8 +48,12 @@ TRIES = 5
 RANDOM = np.random.default_rng()
 
 
-class TooBusyError(Exception):
-    """The loop ended by itself: the machine did not let it keep its time."""
+class EndedEarlyError(Exception):
+    """A loop ended by itself: if it ever `drove`, the machine did not let it keep its time."""
+
+    def __init__(self, said: str, drove: bool) -> None:
+        super().__init__(said)
+        self.drove = drove
 
 
 def await_that(condition: Callable[[], object], limit_s: float = LIMIT_S) -> None:
@@ -112,12 +116,12 @@ class Bench:
 
     def await_drive(self, process: "subprocess.Popen[str]") -> None:
         await_that(lambda: self.driven or process.poll() is not None)
-        self.require_drive(process)
+        self.require_drive(process, drove=False)
 
-    def require_drive(self, process: "subprocess.Popen[str]") -> None:
+    def require_drive(self, process: "subprocess.Popen[str]", drove: bool = True) -> None:
         if not self.driven:
             process.kill()
-            raise TooBusyError(process.communicate()[0])
+            raise EndedEarlyError(process.communicate()[0], drove)
 
     @property
     def driven(self) -> bool:
@@ -134,7 +138,7 @@ class Bench:
         await_that(free_for_long, limit_s=10.0)
         after_s = (self.plant.torque_free_since_ns() - since_ns) * 1e-9
         if after_s.min() < 0.0:
-            raise TooBusyError("it had ended before")
+            raise EndedEarlyError("it had ended before", drove=True)
         return after_s
 
     def end_loop(self, how: str) -> dict[str, float]:
@@ -153,7 +157,7 @@ class Bench:
                 loop.stdin.flush()
                 said = loop.stdout.readline()
                 if not said.strip().isdigit():
-                    raise TooBusyError(said)
+                    raise EndedEarlyError(said, drove=True)
                 since_ns = int(said)
             after_s = self.free_after_s(since_ns)
             if how == "SIGSTOP":  # and on waking up it is refused
@@ -175,9 +179,13 @@ def exists(group: int) -> bool:
 def tried(measure: Callable[[], dict[str, float]]) -> dict[str, float]:
     """Measure again where the machine was too busy for a loop."""
     for _ in range(TRIES):
-        with suppress(TooBusyError):
+        try:
             return measure()
-    pytest.skip("this machine does not let a loop keep its time")
+        except EndedEarlyError as error:
+            early = error
+    if not early.drove:
+        raise early
+    pytest.skip(f"this machine does not let a loop keep its time\n{early}")
 
 
 @contextmanager
@@ -260,7 +268,7 @@ def measure(repeats: int, timeout_s: dict[str, float]) -> list[Row]:
             while len(row.after_s["PHANToM"]) < repeats:
                 try:
                     found = bench.end_loop(how)
-                except TooBusyError:
+                except EndedEarlyError:
                     row.busy += 1
                     continue
                 for part, seconds in found.items():
