@@ -650,6 +650,7 @@ def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
         angles = np.frombuffer(plant, np.float64, 16, 32)
         torques = np.frombuffer(plant, np.float64, 16, 512)
         stamps = np.frombuffer(plant, np.int64, 16, 640)
+        ends = np.frombuffer(plant, np.int64, 16, 768)
         plant[32 : 32 + 32] = np.array([9.0, 0.5, -0.25, 9.0]).tobytes()
         monkeypatch.setenv("FARHAND_FAKE_PLANT", str(path))
         monkeypatch.setenv("FARHAND_FAKE_QUANSER_FIRST", "1")
@@ -664,9 +665,12 @@ def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
             np.testing.assert_allclose(
                 state.position_rad, (0.4 + 0.5, -0.7 - 0.5 - 0.25), rtol=0, atol=1e-3
             )
+            assert not ends.any()
             device.enable()
             device.write(TORQUE)
             pushed = torques.copy()
+            # The watchdog is where the motors are: it needs nobody in this process.
+            np.testing.assert_array_equal(ends[:4], [0, *[clock.ns + 20_000_000] * 2, 0])
         finally:
             device.close()
         np.testing.assert_allclose(
@@ -676,4 +680,4 @@ def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
         assert (stamps[1:3] > 0).all()
         assert not stamps[3:].any()
         assert angles[1] == 0.5
-        del angles, torques, stamps  # views into the map, which cannot be closed under them
+        del angles, torques, stamps, ends  # views into the map, which cannot be closed under them
