@@ -19,6 +19,7 @@ from ctypes import (
 )
 from typing import Any, Final
 
+HD_CURRENT_BUTTONS: Final = 0x2000  # 1 int: the bits 1, 2, 4, 8 of buttons that are down
 HD_CURRENT_POSITION: Final = 0x2050  # 3 doubles, mm, of an arm with the vendor's link lengths
 HD_CURRENT_JOINT_ANGLES: Final = 0x2100  # 3 doubles, rad
 HD_CURRENT_JOINT_TORQUE: Final = 0x2703  # 3 doubles, mN·m; overrides HD_CURRENT_FORCE

@@ -37,7 +37,8 @@ class PhantomSettings:
     `joint_offset_rad`, β1 and β2, relate the device's zero to the robot's; `motor_torque_limit_nm`
     holds for thigh and shin. `timeout_s` is the longest silence between site and servo, either
     way, that is not a fault. Velocity is the difference of positions through a first-order filter
-    of time constant `difference_filter_s`.
+    of time constant `difference_filter_s`. `clutch_button` says that the device has buttons: any of
+    them, held down, is the clutch. One without a stylus may read noise there.
     """
 
     joint_offset_rad: tuple[float, float]
@@ -50,6 +51,7 @@ class PhantomSettings:
     torque_ramp_s: float = 0.5
     timeout_s: float = 0.01
     difference_filter_s: float = 0.0038
+    clutch_button: bool = False
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(angle) for angle in self.joint_offset_rad):
@@ -101,8 +103,8 @@ class PhantomDevice:
 
     @property
     def joint_stops(self) -> JointStops:
-        """None are known."""
-        return JointStops.none(2)
+        """The mechanism's own, whichever way the third angle is given."""
+        return self._arm.stops
 
     def open(self) -> None:
         """Start the servo process and take the device, outputs off."""
@@ -115,6 +117,7 @@ class PhantomDevice:
                 settings.device_name,
                 settings.motor_torque_limit_nm,
                 settings.timeout_s,
+                settings.clutch_button,
                 _above(os.sched_getparam(0).sched_priority),
             )
         )
@@ -171,7 +174,7 @@ class PhantomDevice:
     def read(self) -> DeviceState:
         """Return the newest state of the servo loop; the wrench is not measured and is zero."""
         servo = self._sound()
-        stamp_ns, _, resets, _, *values = servo.memory.state.get()
+        stamp_ns, _, resets, _, buttons, *values = servo.memory.state.get()
         age_ns = time.monotonic_ns() - stamp_ns
         if age_ns > self._timeout_ns:
             raise self._failed(
@@ -184,7 +187,8 @@ class PhantomDevice:
                 self._take_third_angle()
         position_rad = self._arm.serial_rad(values[1], values[2])
         self._difference(position_rad, stamp_ns)
-        return DeviceState(position_rad, self._velocity_rad_s.copy(), np.zeros(6), stamp_ns)
+        velocity_rad_s = self._velocity_rad_s.copy()
+        return DeviceState(position_rad, velocity_rad_s, np.zeros(6), stamp_ns, clutch=buttons != 0)
 
     def write(self, torque_nm: FloatArray) -> None:
         """Hand joint torques (2,) [N·m] to the servo loop, cut to the motors' limits there."""

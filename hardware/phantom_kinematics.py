@@ -11,12 +11,18 @@ from typing import Literal
 
 import numpy as np
 
-from hardware.interface import FloatArray
+from hardware.interface import FloatArray, JointStops
 
 ThirdAngle = Literal["absolute", "relative"]
 
 # Vendor's link lengths [m], by which HD_CURRENT_POSITION is computed whatever is mounted.
 NATIVE_LENGTHS_M = (0.2096, 0.1695)
+
+# Where the mechanism ends, in absolute angles: θ2, θ3, and θ3 − θ2, which the parallelogram limits
+# (mahilab/Phantom, validate_angles: θ2 − θ3 ≤ 65°, θ3 − θ2 ≤ 55°).
+THIGH_STOPS_RAD = (math.radians(-124.0), math.radians(119.0))
+SHIN_STOPS_RAD = (math.radians(-29.0), math.radians(214.0))
+BEND_STOPS_RAD = (math.radians(-65.0), math.radians(55.0))
 
 DECIDING_M = 0.008
 CLEAR_SHARE = 0.25
@@ -40,6 +46,14 @@ class Parallelogram:
         """Return the torques on the device's angles that do what τ_q (2,) does."""
         first, second = float(torque_nm[0]), float(torque_nm[1])
         return (first - second if self.third_angle == "absolute" else first), second
+
+    @property
+    def stops(self) -> JointStops:
+        """The mechanism's: θ2 is q1, θ3 is q1 + q2 and θ3 − θ2 is q2, each but for a constant."""
+        matrix = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        zero_rad = matrix @ self.serial_rad(0.0, 0.0)
+        lower_rad, upper_rad = np.transpose([THIGH_STOPS_RAD, SHIN_STOPS_RAD, BEND_STOPS_RAD])
+        return JointStops(matrix, zero_rad + lower_rad, zero_rad + upper_rad)
 
 
 class ThirdAngleCheck:

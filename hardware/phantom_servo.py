@@ -15,7 +15,7 @@ import signal
 import struct
 import sys
 import time
-from ctypes import c_double
+from ctypes import c_double, c_int32
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -24,6 +24,7 @@ from hardware.hdapi import (
     HD_CALIBRATION_OK,
     HD_CALLBACK_CONTINUE,
     HD_CALLBACK_DONE,
+    HD_CURRENT_BUTTONS,
     HD_CURRENT_JOINT_ANGLES,
     HD_CURRENT_JOINT_TORQUE,
     HD_CURRENT_POSITION,
@@ -81,7 +82,8 @@ class ServoMemory:
 
     `command`: stamp [ns] or 0, number of the enabling it belongs to or 0 for outputs off, encoder
     resets asked for, torques of thigh and shin [N·m]. `state`: stamp [ns], number of the enabling
-    in force, encoder resets done, whether calibrated, joint angles (3) [rad], position (3) [mm].
+    in force, encoder resets done, whether calibrated, bits of the buttons that are down, joint
+    angles (3) [rad], position (3) [mm].
     `phase` is STARTING, RUNNING or FAULT, `text` who the device is or why it failed.
     """
 
@@ -90,7 +92,7 @@ class ServoMemory:
     def __init__(self, memory: mmap.mmap) -> None:
         view = memoryview(memory)
         self.command = SharedRecord(view[:256], "qQQ2d")
-        self.state = SharedRecord(view[256:512], "qQQQ3d3d")
+        self.state = SharedRecord(view[256:512], "qQQQq3d3d")
         self._phase = view[512:520].cast("Q")
         self._text = view[520:]
 
@@ -115,13 +117,15 @@ class ServoMemory:
 class ServoOptions:
     """What the site tells its servo process; torque limits of thigh and shin.
 
-    `priority` is of SCHED_FIFO, 0 for ordinary scheduling.
+    `buttons` says whether the device has any. `priority` is of SCHED_FIFO, 0 for ordinary
+    scheduling.
     """
 
     library: str
     device_name: str
     torque_limit_nm: tuple[float, float]
     timeout_s: float
+    buttons: bool = False
     priority: int = 0
 
     def to_json(self) -> str:
@@ -140,6 +144,7 @@ class Servo:
         self._angles = (c_double * 3)()
         self._position = (c_double * 3)()
         self._torque = (c_double * 3)()
+        self._buttons = c_int32()
         self._outputs = 0
         self._resets = self._resetting = 0
         self._calibrated = False
@@ -197,6 +202,8 @@ class Servo:
         try:
             hd.hdGetDoublev(HD_CURRENT_JOINT_ANGLES, self._angles)
             hd.hdGetDoublev(HD_CURRENT_POSITION, self._position)
+            if self._options.buttons:
+                hd.hdGetIntegerv(HD_CURRENT_BUTTONS, self._buttons)
             error = pop_errors(hd) or self._disbelief(now_ns)
             if error is not None:
                 self._fail(error)
@@ -205,7 +212,13 @@ class Servo:
         finally:
             hd.hdEndFrame(self._device)
         self._memory.state.put(
-            now_ns, self._outputs, self._resets, self._calibrated, *self._angles, *self._position
+            now_ns,
+            self._outputs,
+            self._resets,
+            self._calibrated,
+            self._buttons.value,
+            *self._angles,
+            *self._position,
         )
 
     def _torque_mnm(self) -> tuple[float, float]:

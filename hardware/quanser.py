@@ -48,7 +48,8 @@ class QuanserSettings:
     + drive_matrix φ: the identity if each encoder and motor act between two links, [[1, 0],
     [-1, 1]] if the second acts on the second link's absolute angle. Motor i is given
     motor_sign_i · current_i / amplifier_gain_a_per_v_i volts and pushes φ_i with
-    torque_constant_nm_per_a_i · current_i, gear included.
+    torque_constant_nm_per_a_i · current_i, gear included. `joint_min_rad` and `joint_max_rad`, both
+    or neither, are the q where the robot's joints end.
     """
 
     driver: Literal["quanser"] = "quanser"
@@ -66,6 +67,8 @@ class QuanserSettings:
     torque_constant_nm_per_a: tuple[float, ...]
     drive_matrix: tuple[tuple[float, ...], ...]
     reference_position_rad: tuple[float, ...]
+    joint_min_rad: tuple[float, ...] | None = None
+    joint_max_rad: tuple[float, ...] | None = None
     zero_at_open: bool = True
     peak_a: tuple[float, ...]
     continuous_a: tuple[float, ...]
@@ -135,6 +138,7 @@ class QuanserSettings:
                 f"reference_position_rad is {self.reference_position_rad}; must be finite"
             )
         self._check_drive_matrix(n)
+        self._check_joint_range(n)
         for name, low, high in (
             ("sample_rate_hz", 100, 10_000),
             ("velocity_filter_s", 0.0, 1.0),
@@ -157,6 +161,26 @@ class QuanserSettings:
             raise DeviceConfigurationError(
                 f"drive_matrix is {rows}; each of q and φ must tell the other"
             )
+
+    def _check_joint_range(self, n: int) -> None:
+        low, high = self.joint_min_rad, self.joint_max_rad
+        if low is None and high is None:
+            return
+        if low is None or high is None:
+            raise DeviceConfigurationError(
+                f"joint_min_rad is {low}, joint_max_rad is {high}; give both, or neither"
+            )
+        for name, bounds in (("joint_min_rad", low), ("joint_max_rad", high)):
+            if len(bounds) != n or not all(math.isfinite(bound) for bound in bounds):
+                raise DeviceConfigurationError(f"{name} is {bounds}; {n} finite angles are needed")
+        for joint, (least, reference, most) in enumerate(
+            zip(low, self.reference_position_rad, high, strict=True)
+        ):
+            if not (least < most and least <= reference <= most):
+                raise DeviceConfigurationError(
+                    f"joint_min_rad[{joint}] is {least}, joint_max_rad[{joint}] is {most}; the "
+                    f"first must be the smaller, and reference_position_rad, {reference}, between"
+                )
 
     @property
     def difference_filter_s(self) -> float | None:
@@ -220,8 +244,11 @@ class QuanserDevice:
 
     @property
     def joint_stops(self) -> JointStops:
-        """None are known."""
-        return JointStops.none(self._joints)
+        """Those of the settings."""
+        low, high = self._settings.joint_min_rad, self._settings.joint_max_rad
+        if low is None or high is None:
+            return JointStops.none(self._joints)
+        return JointStops(np.eye(self._joints), np.array(low), np.array(high))
 
     def open(self) -> None:
         """Connect to the board, outputs off, and start sampling; zero the encoders if asked to."""

@@ -190,7 +190,7 @@ def phantom() -> Bench:
 
 
 def quanser() -> Bench:
-    quanser = QuanserBench()
+    quanser = QuanserBench(joint_min_rad=(-1.0, -2.0), joint_max_rad=(1.5, 0.5))
 
     def unplug() -> None:
         quanser.board.unplug()
@@ -300,6 +300,24 @@ def test_a_reading_is_finite_fresh_and_of_the_declared_shape(enabled: Bench) -> 
     run(enabled, 5)
     np.testing.assert_array_equal(states[-1].position_rad, kept[0])
     np.testing.assert_array_equal(states[-1].velocity_rad_s, kept[1])
+
+
+def test_stops_are_there_before_opening_and_stay(bench: Bench) -> None:
+    before = bench.device.joint_stops
+    count = len(before.matrix)
+    assert before.matrix.shape == (count, bench.device.joints)
+    assert before.lower_rad.shape == before.upper_rad.shape == (count,)
+    assert np.isfinite(before.matrix).all()
+    assert before.matrix.any(axis=1).all()
+    assert (before.lower_rad < before.upper_rad).all()
+    bring_to(bench, "moving")
+    position_rad = before.matrix @ bench.device.read().position_rad
+    assert ((before.lower_rad <= position_rad) & (position_rad <= before.upper_rad)).all()
+    for _ in range(2):
+        for name in ("matrix", "lower_rad", "upper_rad"):
+            now = getattr(bench.device.joint_stops, name)
+            np.testing.assert_array_equal(now, getattr(before, name))
+        bench.device.close()
 
 
 def test_units_are_radians_and_newtons(enabled: Bench) -> None:

@@ -4,6 +4,10 @@
 as SESSION describes it, touched by the session's operator or environment. The fakes of PHANToM,
 Quanser and JR3 map the same file: they read positions and wrench, and write torques. All numbers
 in it are in device coordinates d, with q = A d + b and τ_d = Aᵀ τ_q.
+
+A torque may be given an end, as a board's watchdog has: the plant keeps it, whatever becomes of
+the process that wrote the torque. And the plant says since when, by its own clock, it has applied
+none.
 """
 
 import argparse
@@ -51,6 +55,8 @@ _LAYOUT = {
     "wrench": (288, "<f8", 6),
     "torque_nm": (512, "<f8", MOST_JOINTS),
     "torque_stamp_ns": (640, "<i8", MOST_JOINTS),
+    "torque_end_ns": (768, "<i8", MOST_JOINTS),  # 0: none
+    "torque_free_since_ns": (896, "<i8", MOST_JOINTS),  # 0: torque is applied
 }
 _STATE = struct.Struct(f"<qII{2 * MOST_JOINTS + 6}d")
 _STATE_BEGIN = _LAYOUT["stamp_ns"][0]
@@ -131,8 +137,22 @@ class PlantMemory:
         self._fields["torque_stamp_ns"][own] = time.monotonic_ns()
 
     def torque_nm(self) -> FloatArray:
-        """Return the torques of all joints (n,)."""
-        return self._fields["torque_nm"][: self.joints].copy()
+        """Return the torques of all joints (n,), zero where their end has come."""
+        n = self.joints
+        end_ns = self._fields["torque_end_ns"][:n]
+        ended = (end_ns != 0) & (end_ns <= time.monotonic_ns())
+        return np.where(ended, 0.0, self._fields["torque_nm"][:n])
+
+    def note_applied(self, torque_nm: FloatArray) -> None:
+        """Keep since when each joint has been without torque, as the plant does."""
+        since_ns = self._fields["torque_free_since_ns"][: len(torque_nm)]
+        free = torque_nm == 0.0
+        since_ns[~free] = 0
+        since_ns[free & (since_ns == 0)] = time.monotonic_ns()
+
+    def torque_free_since_ns(self) -> npt.NDArray[np.int64]:
+        """Return since when the plant has applied no torque to each joint (n,); 0: it does."""
+        return self._fields["torque_free_since_ns"][: self.joints].copy()
 
     def publish(self, state: PlantState) -> None:
         """Set the state, as the plant does."""
@@ -214,10 +234,11 @@ class Plant:
                 state.stamp_ns,
             )
         )
-        torque_nm = self._to_device.T @ self.memory.torque_nm()
-        if self._contact.start_s is None and torque_nm.any():
+        motor_nm = self.memory.torque_nm()
+        if self._contact.start_s is None and motor_nm.any():
             self._contact.start_s = state.stamp_ns * 1e-9
-        self._device.write(torque_nm)
+        self._device.write(self._to_device.T @ motor_nm)
+        self.memory.note_applied(motor_nm)
 
     def close(self) -> None:
         """Say that the plant has ended, and let go of the file."""

@@ -89,6 +89,9 @@ class Plant(Protocol):
 
     def push(self, torque_nm: list[float], from_ns: int, to_ns: int) -> None: ...
 
+    def end_torque_at(self, at_ns: int | None) -> None:
+        """Take the watchdog's deadline, for a plant that outlives the process of the board."""
+
 
 class FreeJoints:
     """Joints that do not know of each other: I φ̈ = τ + hand − d φ̇."""
@@ -121,9 +124,15 @@ class FreeJoints:
                     self._velocity[i] = 0.0
                 self._angle[i] += step_s * self._velocity[i]
 
+    def end_torque_at(self, at_ns: int | None) -> None:
+        """The board, in the same process, ends it."""
+
 
 class SharedPlant:
-    """Some joints of the plant that another process runs; the layout is tests/fakes/plant.py's."""
+    """Some joints of the plant that another process runs; the layout is tests/fakes/plant.py's.
+
+    That process plays the board's watchdog too: it runs on where this one is killed or stands.
+    """
 
     def __init__(self, path: str, first: int, joints: int) -> None:
         with open(path, "r+b") as file:
@@ -144,6 +153,14 @@ class SharedPlant:
         struct.pack_into(f"<{self._joints}d", self._map, 512 + 8 * self._first, *torque_nm)
         stamps = [now_ns] * self._joints
         struct.pack_into(f"<{self._joints}q", self._map, 640 + 8 * self._first, *stamps)
+
+    def end_torque_at(self, at_ns: int | None) -> None:
+        ends = [at_ns or 0] * self._joints
+        struct.pack_into(f"<{self._joints}q", self._map, 768 + 8 * self._first, *ends)
+
+    def torque_has_ended(self) -> bool:
+        (end_ns,) = struct.unpack_from("<q", self._map, 768 + 8 * self._first)
+        return 0 < end_ns <= time.monotonic_ns()
 
 
 class ManualTime:
@@ -392,14 +409,21 @@ class Board:
             )
         return counts
 
-    def _expire(self) -> None:
-        self._deadline_ns = None
-        self._expired = True
+    def _set_deadline(self, deadline_ns: int | None) -> None:
+        self._deadline_ns = deadline_ns
+        self.plant.end_torque_at(deadline_ns if self._lets_go_on_expiry() else None)
+
+    def _lets_go_on_expiry(self) -> bool:
         analog = self._analog_expiry and not any(self._analog_expiry.values())
         digital = self._digital_expiry and all(
             state == DigitalState.TRISTATE for state in self._digital_expiry.values()
         )
-        if analog and digital:
+        return bool(analog and digital)
+
+    def _expire(self) -> None:
+        self._deadline_ns = None
+        self._expired = True
+        if self._lets_go_on_expiry():
             for channel in self._analog_expiry:
                 self._volts[channel] = 0.0
             for channel in self._digital_expiry:
@@ -581,7 +605,7 @@ class HIL:
         board = self._opened()
         with board.access("start watchdog"):
             board._timeout_ns = round(timeout * 1e9)
-            board._deadline_ns = board.now_ns() + board._timeout_ns
+            board._set_deadline(board.now_ns() + board._timeout_ns)
 
     def watchdog_reload(self) -> bool:
         board = self._opened()
@@ -589,7 +613,7 @@ class HIL:
             if board._expired:
                 return False
             if board._deadline_ns is not None:
-                board._deadline_ns = board.now_ns() + board._timeout_ns
+                board._set_deadline(board.now_ns() + board._timeout_ns)
             return True
 
     def watchdog_is_expired(self) -> bool:
@@ -602,13 +626,14 @@ class HIL:
         board = self._opened()
         with board.access("clear watchdog", blocked=False):
             board._expired = False
+            board.plant.end_torque_at(None)
             for channel in board._digital_expiry:
                 board._directions[channel] = "out"
 
     def watchdog_stop(self) -> None:
         board = self._opened()
         with board.access("stop watchdog", blocked=False):
-            board._deadline_ns = None
+            board._set_deadline(None)
 
     def _opened(self) -> Board:
         if self._board is None:
@@ -634,7 +659,10 @@ def _default() -> Board:
     if path is None:
         return Board()
     first = int(os.environ.get("FARHAND_FAKE_QUANSER_FIRST", "0"))
-    return Board(plant=SharedPlant(path, first, len(Robot().encoder_channels)))
+    plant = SharedPlant(path, first, len(Robot().encoder_channels))
+    board = Board(plant=plant)
+    board._expired = plant.torque_has_ended()  # in a program before this one
+    return board
 
 
 def _given(buffer: object, kind: type[np.generic], count: int) -> "np.ndarray":

@@ -15,6 +15,7 @@ from site_runtime.keys import SiteId
 from site_runtime.parts import robot_of
 from site_runtime.session import load_session
 from tests.fakes.plant import MAGIC, PARALLELOGRAM, SIZE, Plant, PlantMemory, PlantState
+from tests.fakes.quanser_hardware import SharedPlant
 
 SESSION = Path(__file__).parents[2] / "experiments" / "figure_5.toml"
 START = np.array([0.807, 1.629])
@@ -110,6 +111,30 @@ def test_the_hand_waits_until_the_robot_is_driven(
     wrench = plant.memory.read().wrench
     assert wrench[0] == pytest.approx(1.6 * np.sin(np.pi * 2.0 / 8.0) ** 2, rel=1e-3)
     assert not wrench[1:].any()
+
+
+def test_torque_ends_at_its_end_whoever_wrote_it(
+    plant: Plant, clock: Callable[[float], None], tmp_path: Path
+) -> None:
+    board = SharedPlant(str(tmp_path / "plant"), 0, 1)
+    assert not board.torque_has_ended()
+    plant.memory.write_torque(0, [0.1, 0.2])
+    board.end_torque_at(time.monotonic_ns() + 2_000_000)
+    plant.step()
+    np.testing.assert_array_equal(plant.memory.torque_nm(), [0.1, 0.2])
+    assert not plant.memory.torque_free_since_ns().any()
+    clock(0.002)
+    assert board.torque_has_ended()
+    ended_ns = time.monotonic_ns()
+    for _ in range(3):
+        plant.step()
+        clock(0.001)
+    np.testing.assert_array_equal(plant.memory.torque_nm(), [0.0, 0.2])
+    np.testing.assert_array_equal(plant.memory.torque_free_since_ns(), [ended_ns, 0])
+    board.end_torque_at(None)
+    plant.step()
+    np.testing.assert_array_equal(plant.memory.torque_nm(), [0.1, 0.2])
+    assert not plant.memory.torque_free_since_ns().any()
 
 
 @pytest.mark.processes

@@ -457,6 +457,42 @@ def test_a_library_that_never_returns(bench: Bench, monkeypatch: pytest.MonkeyPa
     assert not Path(f"/proc/{pid}").exists()
 
 
+# Joint stops and the clutch button.
+
+
+@pytest.mark.parametrize("relative", [0, 1])
+def test_an_arm_at_its_stop_reads_a_position_on_the_bound(
+    make: Callable[..., Bench], relative: int
+) -> None:
+    third = "relative" if relative else "absolute"
+    bench = make(theta3=third, joint_offset_rad=(0.1, math.pi))
+    bench.fake.block.theta3_relative = relative
+    bench.fake.block.angle_rad[:] = (0.0, math.radians(40.0), math.radians(95.0))
+    stops = bench.device.joint_stops
+    bench.device.open()
+    along = stops.matrix @ bench.device.read().position_rad
+    assert along[2] == pytest.approx(stops.upper_rad[2], abs=3e-4)  # two encoders' resolution
+    assert (stops.lower_rad < along).all()
+    assert (along[:2] < stops.upper_rad[:2]).all()
+
+
+def test_any_button_held_down_is_the_clutch(make: Callable[..., Bench]) -> None:
+    bench = make(clutch_button=True)
+    bench.enable()
+    assert bench.push().clutch is False
+    for bits in (1, 2, 4, 8, 5):
+        bench.fake.block.buttons = bits
+        assert bench.push().clutch is True
+        bench.fake.block.buttons = 0
+        assert bench.push().clutch is False
+    assert bench.fake.block.errors == 0
+
+
+def test_a_button_line_that_nobody_asked_for_is_not_looked_at(pushing: Bench) -> None:
+    pushing.fake.block.buttons = 3
+    assert pushing.push().clutch is False
+
+
 # Calibration and the third angle.
 
 
@@ -580,11 +616,15 @@ class Library:
 
 
 @pytest.mark.parametrize(
-    "failing", ["hdBeginFrame", "hdGetDoublev", "hdGetError", "hdSetDoublev", "hdEndFrame"]
+    "failing",
+    [
+        *("hdBeginFrame", "hdGetDoublev", "hdGetIntegerv", "hdGetError"),
+        *("hdSetDoublev", "hdEndFrame"),
+    ],
 )
 def test_a_callback_never_raises_and_ends_every_frame_it_began(failing: str) -> None:
     memory = ServoMemory(memoryview(bytearray(ServoMemory.SIZE)))  # type: ignore[arg-type]
-    servo = Servo(ServoOptions("", "", (0.3, 0.3), 0.01), memory)
+    servo = Servo(ServoOptions("", "", (0.3, 0.3), 0.01, buttons=True), memory)
     servo._hd = library = Library(failing)  # type: ignore[assignment]
     servo._device = 0
     for _ in range(2):

@@ -83,6 +83,46 @@ def test_torque_of_the_jacobian_pushes_with_one_force_and_power_in_both(third: T
         )
 
 
+# Poses of absolute angles [degrees] at one stop each, in the order of the rows.
+AT_STOPS = [
+    ("lower", 0, (-124.0, -100.0)),
+    ("upper", 0, (119.0, 100.0)),
+    ("lower", 1, (10.0, -29.0)),
+    ("upper", 1, (100.0, 214.0)),
+    ("lower", 2, (90.0, 25.0)),  # folded: θ2 − θ3 = 65°
+    ("upper", 2, (-20.0, 35.0)),  # stretched: θ3 − θ2 = 55°
+]
+
+
+@pytest.mark.parametrize("third", ["absolute", "relative"])
+@pytest.mark.parametrize(("side", "row", "degrees"), AT_STOPS)
+def test_a_pose_at_a_stop_is_on_its_bound(
+    side: str, row: int, degrees: tuple[float, float], third: ThirdAngle
+) -> None:
+    arm = Parallelogram((0.3, math.pi - 0.2), third)
+    stops = arm.stops
+    bound_rad = getattr(stops, f"{side}_rad")[row]
+
+    def along(theta: np.ndarray) -> float:
+        return float(stops.matrix[row] @ arm.serial_rad(*given(theta, third)))
+
+    theta = np.radians(degrees)
+    assert along(theta) == pytest.approx(bound_rad, abs=1e-12)
+    outward = {0: (1.0, 0.0), 1: (0.0, 1.0), 2: (-1.0, 1.0)}[row]
+    step = np.multiply(1e-3 if side == "upper" else -1e-3, outward)
+    beyond = along(theta + step) - bound_rad
+    assert (beyond > 0.0) == (side == "upper")
+
+
+def test_the_folded_arm_s_stop_is_where_its_links_are_25_degrees_apart() -> None:
+    links = []
+    for bound in Parallelogram((0.0, 0.0), "absolute").stops.lower_rad[2:]:
+        q = np.array([0.4, bound])
+        tip, elbow = ROBOT.terms(q, np.zeros(2)).X, L1 * np.array([math.cos(0.4), math.sin(0.4)])
+        links.append(math.acos(np.dot(-elbow, tip - elbow) / (L1 * L2)))
+    assert np.degrees(links) == pytest.approx([25.0])
+
+
 def feed(check: ThirdAngleCheck, path: np.ndarray, third: ThirdAngle, turret: float = 0.4) -> int:
     """Show a check the poses of a path as a device with slightly other link lengths would."""
     for count, theta in enumerate(path):

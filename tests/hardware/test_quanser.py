@@ -589,6 +589,18 @@ def test_a_motor_that_is_too_hot_by_a_stall_gets_less_than_it_bears() -> None:
 # Settings
 
 
+def stops(low: tuple[float, ...], high: tuple[float, ...]) -> dict[str, Any]:
+    return {"joint_min_rad": low, "joint_max_rad": high}
+
+
+def test_stops_are_those_of_the_settings_on_the_joints_it_presents() -> None:
+    given = QuanserBench(**stops((-1.0, -1.5), (0.5, 0.25))).device.joint_stops
+    np.testing.assert_array_equal(given.matrix, np.eye(2))
+    np.testing.assert_array_equal(given.lower_rad, (-1.0, -1.5))
+    np.testing.assert_array_equal(given.upper_rad, (0.5, 0.25))
+    assert QuanserBench().device.joint_stops.matrix.shape == (0, 2)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -607,6 +619,13 @@ def test_a_motor_that_is_too_hot_by_a_stall_gets_less_than_it_bears() -> None:
         ({"drive_matrix": ((1.0,), (0.0, 1.0))}, "2 rows of 2"),
         ({"drive_matrix": ((1.0, 1.0), (1.0, 1.0))}, "must tell the other"),
         ({"reference_position_rad": (0.0, np.nan)}, "must be finite"),
+        ({"joint_min_rad": (-1.0, -1.0)}, "joint_max_rad is None; give both"),
+        ({"joint_max_rad": (1.0, 1.0)}, "joint_min_rad is None, joint_max_rad is .*give both"),
+        (stops((-1.0,), (1.0, 0.0)), r"joint_min_rad is \(-1.0,\); 2 finite angles"),
+        (stops((-1.0, -1.0), (1.0, np.inf)), "joint_max_rad is .*2 finite angles"),
+        (stops((-1.0, 0.0), (1.0, -1.0)), r"joint_min_rad\[1\] is 0.0, .* the smaller"),
+        (stops((0.5, -1.0), (1.0, 0.0)), r"joint_min_rad\[0\] is 0.5, .* 0.4, between"),
+        (stops((-1.0, -1.0), (1.0, -0.8)), r"joint_max_rad\[1\] is -0.8; .* -0.7, between"),
         ({"watchdog_s": 0.5}, "watchdog_s is 0.5; choose between 0.003 and 0.1"),
         ({"sample_rate_hz": 5}, "sample_rate_hz is 5; choose between 100 and 10000"),
         ({"velocity_filter_s": -1.0}, "velocity_filter_s"),
@@ -631,6 +650,7 @@ def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
         angles = np.frombuffer(plant, np.float64, 16, 32)
         torques = np.frombuffer(plant, np.float64, 16, 512)
         stamps = np.frombuffer(plant, np.int64, 16, 640)
+        ends = np.frombuffer(plant, np.int64, 16, 768)
         plant[32 : 32 + 32] = np.array([9.0, 0.5, -0.25, 9.0]).tobytes()
         monkeypatch.setenv("FARHAND_FAKE_PLANT", str(path))
         monkeypatch.setenv("FARHAND_FAKE_QUANSER_FIRST", "1")
@@ -645,9 +665,12 @@ def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
             np.testing.assert_allclose(
                 state.position_rad, (0.4 + 0.5, -0.7 - 0.5 - 0.25), rtol=0, atol=1e-3
             )
+            assert not ends.any()
             device.enable()
             device.write(TORQUE)
             pushed = torques.copy()
+            # The watchdog is where the motors are: it needs nobody in this process.
+            np.testing.assert_array_equal(ends[:4], [0, *[clock.ns + 20_000_000] * 2, 0])
         finally:
             device.close()
         np.testing.assert_allclose(
@@ -657,4 +680,4 @@ def test_without_further_ado_the_fake_drives_its_joints_of_the_shared_plant(
         assert (stamps[1:3] > 0).all()
         assert not stamps[3:].any()
         assert angles[1] == 0.5
-        del angles, torques, stamps  # views into the map, which cannot be closed under them
+        del angles, torques, stamps, ends  # views into the map, which cannot be closed under them

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from hardware import registry
-from hardware.interface import DeviceConfigurationError, DeviceError, DeviceState, FloatArray
+from hardware.interface import (
+    DeviceConfigurationError,
+    DeviceError,
+    DeviceState,
+    FloatArray,
+    JointStops,
+)
 from hardware.registry import DeviceContext, DriverEntry
 from hardware.robot_model import PlanarArm, build_robot
 from hardware.serial_pair import DRIVER, SerialPair, SerialPairSettings
@@ -29,6 +35,8 @@ class Part:
     fails: set[str] = field(default_factory=set)
     torque_nm: FloatArray | None = None
     joints: int = 2
+    joint_stops: JointStops = field(default_factory=lambda: JointStops.none(2))
+    clutch: bool = False
 
     def _call(self, method: str) -> None:
         self.log.append(f"{self.name}.{method}")
@@ -44,7 +52,9 @@ class Part:
     def read(self) -> DeviceState:
         self._call("read")
         values = self.first + np.arange(2.0)
-        return DeviceState(values, 10.0 * values, np.full(6, self.first), self.stamp_ns)
+        return DeviceState(
+            values, 10.0 * values, np.full(6, self.first), self.stamp_ns, self.clutch
+        )
 
     def write(self, torque_nm: FloatArray) -> None:
         self._call("write")
@@ -92,6 +102,32 @@ def test_joints_are_the_proximal_ones_then_the_distal_ones(bench: Bench) -> None
     bench.pair.write(np.array([0.1, 0.2, 0.3, 0.4]))
     np.testing.assert_array_equal(bench.near.torque_nm, [0.1, 0.2])
     np.testing.assert_array_equal(bench.far.torque_nm, [0.3, 0.4])
+
+
+def test_stops_are_the_parts_each_on_its_own_joints(bench: Bench) -> None:
+    bench.near.joint_stops = JointStops(np.array([[1.0, 2.0]]), np.array([-0.1]), np.array([0.1]))
+    bench.far.joint_stops = JointStops(
+        np.array([[3.0, 0.0], [4.0, 5.0]]), np.array([-0.2, -0.3]), np.array([0.2, 0.3])
+    )
+    stops = bench.pair.joint_stops
+    np.testing.assert_array_equal(
+        stops.matrix, [[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0], [0.0, 0.0, 4.0, 5.0]]
+    )
+    np.testing.assert_array_equal(stops.lower_rad, [-0.1, -0.2, -0.3])
+    np.testing.assert_array_equal(stops.upper_rad, [0.1, 0.2, 0.3])
+    bench.near.joint_stops = JointStops.none(2)
+    np.testing.assert_array_equal(
+        bench.pair.joint_stops.matrix, [[0.0, 0.0, 3.0, 0.0], [0.0, 0.0, 4.0, 5.0]]
+    )
+
+
+def test_the_button_of_either_is_the_clutch(bench: Bench) -> None:
+    bench.enabled()
+    assert not bench.pair.read().clutch
+    for part in (bench.near, bench.far):
+        part.clutch = True
+        assert bench.pair.read().clutch
+        part.clutch = False
 
 
 def test_opening_is_undone_when_the_second_part_fails(bench: Bench) -> None:

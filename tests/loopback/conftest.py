@@ -28,7 +28,9 @@ from telemetry.rows import RowArray
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 BUILD = {SiteId.LOCAL: build_local_site, SiteId.REMOTE: build_remote_site}
-ENGAGEMENT = EngagementSettings(ramp_s=0.3, sub_task_ramp_s=0.3, hold_after_s=0.05, blend_s=0.2)
+ENGAGEMENT = EngagementSettings(
+    alignment="none", ramp_s=0.3, sub_task_ramp_s=0.3, hold_after_s=0.05, blend_s=0.2
+)
 
 
 def both_ways(delay: DelayModel, **effects: object) -> ChannelSettings:
@@ -50,6 +52,7 @@ def demo_session(
         local=replace(demo.local, operator=NoOperator("none")),
         remote=replace(
             demo.remote,
+            device=replace(demo.remote.device, initial_position_rad=(1.5, -0.9, -1.9)),
             environment=replace(demo.remote.environment, walls=()),
             sub_tasks=(ManipulabilityTask("manipulability", 2.0),),
         ),

@@ -39,7 +39,9 @@ def free_session(
         session = make_session(
             make_channel(delay),
             coupling=StiffnessCoupling("stiffness", (STIFFNESS,) * 2, (8.0,) * 2),
-            engagement=EngagementSettings(ramp_s=0.0, sub_task_ramp_s=0.0),
+            engagement=EngagementSettings(
+                alignment="none", ramp_s=0.0, sub_task_ramp_s=0.0, beyond_certificate="warn"
+            ),
         )
         task = (share * DAMPING,) * 2
         device = replace(session.local.device, initial_position_rad=(-0.1, 1.4))

@@ -50,7 +50,7 @@ loop = { rate_hz = 500 }
 real_time = { mode = "try" }
 task = { dimension = 2 }
 coupling = { law = "stiffness", stiffness_n_per_m = $stiffness, force_ceiling_n = [20.0, 20.0] }
-engagement = { ramp_s = $ramp_s, hold_after_s = $hold_after_s, blend_s = 0.5 }
+engagement = { alignment = "none", ramp_s = $ramp_s, hold_after_s = $hold_after_s, blend_s = 0.5 }
 
 [channel]
 injection = "exact"
@@ -195,7 +195,9 @@ class Rig:
         """What the daemons printed, and the last state of each of their runs, for failures."""
         printed = [f"{daemon.site.label}: {daemon.text()}" for daemon in self.daemons]
         states = [
-            f"{site.label}: {State(run[-1]['state'][-1]).name} after {sum(map(len, run))} rows"
+            f"{site.label}: {State(run[-1]['state'][-1]).name} after {sum(map(len, run))} rows; "
+            f"peer {run[-1]['peer_state'][-1]}, loop {run[-1]['loop_bound_s'][-1]} s, "
+            f"late {run[-1]['lateness_ns'][-1]} ns, rejected {run[-1]['rejected'][-1]}"
             for site in BOTH
             for run in self.runs(site)
         ]

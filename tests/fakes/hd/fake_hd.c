@@ -52,7 +52,7 @@ struct block {
     int32_t inject_error, init_error, unplugged, freeze_angles, stall_ms, period_us, warm;
     int32_t theta3_relative, needs_calibration, jump, hang_in_init;
     double value[3];              /* replaces a reported angle wherever `replace` is set */
-    int32_t replace[3], reserved_1;
+    int32_t replace[3], buttons;
     double hand_nm[3], inertia[3], damping[3], max_velocity_rad_s;
     /* watched by tests; angle_rad and zero_rad may be set before the library is loaded */
     double angle_rad[3], velocity_rad_s[3], zero_rad[3];
@@ -456,7 +456,8 @@ static int doubles(HDenum what, double out[6]) {
 static int integers(HDenum what, HDlong out[6]) {
     if (current == NOBODY) { push(BAD_HANDLE); return 0; }
     switch (what) {
-    case BUTTONS: case SAFETY_SWITCH: out[0] = 0; return 1;
+    case BUTTONS: out[0] = block->buttons; return 1;
+    case SAFETY_SWITCH: out[0] = 0; return 1;
     case CALIBRATION_STYLE: out[0] = ENCODER_RESET; return 1;
     case UPDATE_RATE: case INSTANT_RATE:
         out[0] = block->period_us ? 1000000 / block->period_us : (HDlong)rate_hz; return 1;

@@ -39,7 +39,7 @@ class Block(ctypes.Structure):
         *((name, _I32) for name in ("needs_calibration", "jump", "hang_in_init")),
         ("value", _F64 * 3),
         ("replace", _I32 * 3),
-        ("reserved_1", _I32),
+        ("buttons", _I32),
         *((name, _F64 * 3) for name in ("hand_nm", "inertia", "damping")),
         ("max_velocity_rad_s", _F64),
         *((name, _F64 * 3) for name in ("angle_rad", "velocity_rad_s", "zero_rad", "sent_mnm")),
