@@ -29,8 +29,7 @@ def nearest_not_along(vector: FloatArray, rows: FloatArray) -> FloatArray:
                 chosen, shares = _shares(vector, rows, acting)
         except np.linalg.LinAlgError:
             break
-        rest: FloatArray = vector - shares @ chosen
-        result = rest
+        result = vector - shares @ chosen
     return np.zeros_like(vector)
 
 
@@ -39,5 +38,5 @@ def _shares(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rows that act, and how much of each it takes to be free of all of them."""
     chosen = rows[acting]
-    shares: FloatArray = np.linalg.solve(chosen @ chosen.T, chosen @ vector)
-    return chosen, shares
+    shares = np.linalg.solve(chosen @ chosen.T, chosen @ vector)
+    return chosen, np.asarray(shares, np.float64)
