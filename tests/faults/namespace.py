@@ -1,4 +1,4 @@
-"""Network namespaces of one's own, and TUN devices in them: what a network on one machine is made of."""
+"""Network namespaces of one's own, with TUN devices: what a network on one machine is made of."""
 
 import ctypes
 import fcntl

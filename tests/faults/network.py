@@ -4,7 +4,6 @@ import itertools
 import json
 import os
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -13,14 +12,13 @@ from types import TracebackType
 from typing import Self
 
 from tests.faults import namespace
+from tests.faults.companion import Companion
 from tests.faults.packet_queue import ADDRESSES, Impairment, order
 
 __all__ = ["BOTH_WAYS", "CLEAR", "ImpairedNetwork", "Impairment"]
 
-ROOT = Path(__file__).parents[2]
 BOTH_WAYS = (0, 1)
 CLEAR = Impairment()
-_END_S = 10.0
 _numbers = itertools.count()
 
 
@@ -36,17 +34,9 @@ class ImpairedNetwork:
         run = f"{os.getpid()}-{next(_numbers)}"
         self.names = (f"farhand-{run}-a", f"farhand-{run}-b")
         self.dropped = [0, 0]
-        self._wire = subprocess.Popen(
-            [sys.executable, "-m", "tests.faults.packet_queue", *self.names, str(seed)],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            start_new_session=True,  # a Ctrl-C ends it through us, so that it can tidy up
+        self._wire = Companion(
+            [sys.executable, "-m", "tests.faults.packet_queue", *self.names, str(seed)]
         )
-        if self._answer() != "ready\n":
-            self.close()
-            raise OSError("the network's wire did not start: see its error above")
 
     def address(self, side: int) -> str:
         """IP address of a side."""
@@ -54,10 +44,7 @@ class ImpairedNetwork:
 
     def impair(self, impairment: Impairment, sources: Sequence[int] = BOTH_WAYS) -> int:
         """Treat packets from these sides so from now on; return since when [ns, monotonic]."""
-        assert self._wire.stdin is not None
-        self._wire.stdin.write(order(tuple(sources), impairment))
-        self._wire.stdin.flush()
-        answer = json.loads(self._answer())
+        answer = json.loads(self._wire.ask(order(tuple(sources), impairment)))
         self.dropped = answer["dropped"]
         return int(answer["since_ns"])
 
@@ -77,17 +64,7 @@ class ImpairedNetwork:
 
     def close(self) -> None:
         """Remove it. Idempotent, never raises."""
-        wire = self._wire
-        assert wire.stdin is not None
-        assert wire.stdout is not None
-        if not wire.stdin.closed:
-            wire.stdin.close()
-        try:
-            wire.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            wire.kill()
-            wire.wait()
-        wire.stdout.close()
+        self._wire.close()
         for name in self.names:
             if (Path("/run/netns") / name).exists():
                 namespace.delete(name)
@@ -102,10 +79,6 @@ class ImpairedNetwork:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-    def _answer(self) -> str:
-        assert self._wire.stdout is not None
-        return self._wire.stdout.readline()
 
 
 def flap(network: ImpairedNetwork, period_s: float, duration_s: float) -> int:

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from tests.faults import namespace
 
 ADDRESSES = ("10.213.0.1", "10.213.0.2")
-_CAPACITY = 4000  # packets that one direction holds; a full queue drops what comes
+_CAPACITY = 1000  # packets that one direction holds; a full queue drops what comes
 _READS = 64  # packets taken at once, before those due leave
 _LARGEST = 65_535
 _PRIORITY = 70  # below the daemons' loops, above their network threads

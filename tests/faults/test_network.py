@@ -17,7 +17,8 @@ import numpy.typing as npt
 import pytest
 
 from tests.faults import namespace
-from tests.faults.network import CLEAR, ROOT, ImpairedNetwork, Impairment
+from tests.faults.companion import ROOT
+from tests.faults.network import CLEAR, ImpairedNetwork, Impairment
 
 pytestmark = pytest.mark.skipif(
     namespace.refusal() is not None, reason=str(namespace.refusal() or "")
@@ -87,7 +88,7 @@ def test_delay_and_jitter_keep_the_order(network: ImpairedNetwork) -> None:
     network.impair(Impairment(delay_s=0.05, jitter_s=0.02))
     passed = send(network, 500, rate_hz=50.0 * 10)
     assert np.array_equal(passed.number, np.arange(500))
-    assert 0.030 <= passed.took_s.min()
+    assert passed.took_s.min() >= 0.030
     assert np.median(passed.took_s) < 0.09
     assert np.ptp(passed.took_s) > 0.01
 
