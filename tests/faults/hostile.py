@@ -80,7 +80,7 @@ class Intruder:
 
 
 def nonsense(seed: int, site: SiteId, digest: int) -> Iterator[bytes]:
-    """Packets without end, in turns: random bytes, and valid ones of runs that never were.
+    """Packets without end: random bytes, and valid, cut and spoilt ones of runs that never were.
 
     The valid ones carry the session's digest and a point within the workspace; their sender knows
     neither site's epoch. Made in advance: making them must not slow the flood.
@@ -88,21 +88,22 @@ def nonsense(seed: int, site: SiteId, digest: int) -> Iterator[bytes]:
     draw = random.Random(seed)  # noqa: S311  reproducible, not secret
     now_ns = time.monotonic_ns()
     made: list[bytes] = []
-    for sequence in range(1, 2001):
-        made.append(draw.randbytes(draw.choice((0, 5, 69, 156, 156, 400))))
-        made.append(
-            encode(
-                site=site,
-                state=State["ENGAGED"],
-                session=digest,
-                epoch=draw.getrandbits(62) + 1,
-                sequence=sequence,
-                stamp_ns=now_ns + sequence,
-                echo_epoch=draw.getrandbits(62) + 1,
-                echo_stamp_ns=now_ns,
-                echo_arrival_ns=now_ns,
-                used_stamp_ns=now_ns,
-                vectors=np.array([[0.3, 0.3], [0.0, 0.0], [0.0, 0.0]]),
-            )
+    for sequence in range(1, 1001):
+        valid = encode(
+            site=site,
+            state=State["ENGAGED"],
+            session=digest,
+            epoch=draw.getrandbits(62) + 1,
+            sequence=sequence,
+            stamp_ns=now_ns + sequence,
+            echo_epoch=draw.getrandbits(62) + 1,
+            echo_stamp_ns=now_ns,
+            echo_arrival_ns=now_ns,
+            used_stamp_ns=now_ns,
+            vectors=np.array([[0.3, 0.3], [0.0, 0.0], [0.0, 0.0]]),
         )
+        spoilt = bytearray(valid)
+        spoilt[draw.randrange(len(valid))] ^= 1 << draw.randrange(8)
+        cut = valid[: draw.randrange(len(valid))]
+        made += [draw.randbytes(draw.randrange(400)), valid, cut, bytes(spoilt)]
     return itertools.cycle(made)
