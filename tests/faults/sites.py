@@ -183,16 +183,16 @@ class SitePair:
             f"{site.label} leaves {state}",
         )
 
-    def until_steady(self, state: str = "ENGAGED", sites: tuple[SiteId, ...] = BOTH) -> None:
-        """Wait until sites have been in one state for half a second, up to now."""
-        value = State[state]
+    def until_steady(self) -> None:
+        """Wait until both have been ENGAGED on a loop younger than certified for half a second."""
 
-        def steady() -> bool:
-            since_ns = time.monotonic_ns() - round(STEADY_S * 1e9)
-            recent = [self.rows(site, since_ns)["state"] for site in sites]
-            return all(len(states) > 50 and bool((states == value).all()) for states in recent)
+        def steady(site: SiteId) -> bool:
+            rows = self.rows(site, time.monotonic_ns() - round(STEADY_S * 1e9))
+            engaged = rows["state"] == State["ENGAGED"]
+            fresh = rows["round_trip_s"] <= rows["certified_round_trip_s"]
+            return len(rows) > 50 and bool((engaged & fresh).all())
 
-        self.until(steady, f"{', '.join(site.label for site in sites)} steadily {state}")
+        self.until(lambda: all(map(steady, BOTH)), "both steadily ENGAGED on a fresh loop")
 
     def history(self) -> str:
         """What the daemons printed, for failures."""
