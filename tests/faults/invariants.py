@@ -5,6 +5,7 @@ import numpy.typing as npt
 
 from control_law.ramp import smooth_ramp
 from site_runtime.keys import SiteId
+from site_runtime.margin import margin_of
 from site_runtime.session import Session, StiffnessCoupling
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray
@@ -39,6 +40,15 @@ def violations(rows: RowArray, session: Session, site: SiteId) -> list[str]:
         ((torque_nm != 0.0).any(axis=1) & ~among(rows, TORQUE), "torque outside the driven states"),
         ((np.abs(force_n) > ceiling_n + 1e-9).any(axis=1), "coupling force above the ceiling"),
     ]
+    margin = margin_of(session)
+    beyond = rows["loop_bound_s"] > margin.certified_s
+    proven = np.ones(len(rows))
+    proven[beyond] = [
+        margin.share(round(age_s * 1e9) - 2 * session.period_ns)
+        for age_s in rows["loop_bound_s"][beyond]
+    ]
+    least = session.engagement.derate_to * (1.0 - 1e-6)  # of a rounded age
+    checks.append((among(rows, ("ENGAGED",)) & (proven < least), "ENGAGED on a loop too old"))
     excess_n = force_jumps_n(rows, session)
     checks.append((excess_n > 0.0, f"the coupling force jumped, by up to {excess_n.max():.2f} N"))
     return [

@@ -29,6 +29,7 @@ SHAKEN = "ENGAGED( HOLD ENGAGED)*"
 HELD_AND_SHAKEN = "ENGAGED( HOLD ENGAGED)+"
 BACK = "READY ENGAGED( HOLD ENGAGED)*"
 KEPT_OUT = "READY"
+STOPPED = "(ENGAGED )?EMERGENCY_STOP READY ENGAGED"
 STILL_HELD = "ENGAGED HOLD"
 
 
@@ -70,6 +71,22 @@ def suspended(site: SiteId) -> Act:
         stage.fault(site)
         pair.signal(site, signal.SIGCONT)
         pair.until_left(site, stage.since_ns[site])
+
+    return act
+
+
+def stopped(site: SiteId) -> Act:
+    """The operator of one site stops both; then both operators reset."""
+
+    def act(stage: Stage) -> None:
+        pair = stage.pair
+        since_ns = stage.fault()
+        pair.signal(site, signal.SIGUSR1)
+        for each in BOTH:
+            pair.until_left(each, since_ns)
+        time.sleep(HELD_S)
+        for each in BOTH:
+            pair.signal(each, signal.SIGUSR2)
 
     return act
 
@@ -231,6 +248,8 @@ SCENARIOS = (
     Scenario(
         "remote wall clock steps", ON_LOOPBACK, wall_clock_stepped(REMOTE), UNDISTURBED, UNDISTURBED
     ),
+    Scenario("local operator stops", ON_LOOPBACK, stopped(LOCAL), STOPPED, STOPPED, BOTH),
+    Scenario("remote operator stops", ON_LOOPBACK, stopped(REMOTE), STOPPED, STOPPED, BOTH),
     Scenario("second local", ON_LOOPBACK, second_local, UNDISTURBED, UNDISTURBED),
     Scenario("recording to live sites", ON_LOOPBACK, replay_to_live, UNDISTURBED, UNDISTURBED),
     Scenario("flood in the local's name", ON_LOOPBACK, flooded(LOCAL), SHAKEN, SHAKEN),
