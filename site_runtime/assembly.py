@@ -19,6 +19,7 @@ from site_runtime.parts import limits_of, robot_of
 from site_runtime.session import LocalSettings, RemoteSettings, Session
 from site_runtime.site import Site, SiteTimes
 from site_runtime.supervisor import EngagementTimes, Supervisor
+from telemetry.row_ring import Memory
 from telemetry.stream import TelemetryStream
 
 
@@ -28,7 +29,7 @@ class Surroundings:
 
     Session time is zero at `session_start_ns` on its clock; `epoch` names this run and differs
     from every other; `publish` takes telemetry and must not block; `shared_clock` says that both
-    sites read one clock.
+    sites read one clock; `allocate` gives the memory that telemetry rows are kept in.
     """
 
     link: Link
@@ -37,6 +38,7 @@ class Surroundings:
     epoch: int
     publish: Callable[[bytes], None]
     shared_clock: bool = False
+    allocate: Callable[[int], Memory] = bytearray
 
 
 def device_of(settings: LocalSettings | RemoteSettings, context: DeviceContext) -> Device:
@@ -98,7 +100,13 @@ def assemble(
         supervisor=Supervisor(EngagementTimes(start_ns, hold_after_ns, session.engagement.blend_s)),
         guard=Guard(limits_of(own.limits, n, z)),
         telemetry=TelemetryStream(
-            n, z, identity, session.digest, surroundings.epoch, surroundings.publish
+            n,
+            z,
+            identity,
+            session.digest,
+            surroundings.epoch,
+            surroundings.publish,
+            allocate=surroundings.allocate,
         ),
         clock=clock,
         times=SiteTimes(session.period_ns, session.send_period_ns, start_ns),
