@@ -36,6 +36,7 @@ from telemetry.rows import RowArray, TelemetryError, row_dtype
 METADATA: Final = "farhand"
 SESSION_FILE: Final = "session.toml"
 
+_KEYS: Final = frozenset({"site", "joints", "dimension", "wall_offset_ns"})
 _MAGIC_BYTES: Final = 8
 _RECORD: Final = struct.Struct("<BQ")  # opcode, bytes that follow
 
@@ -231,7 +232,7 @@ def _read(path: Path) -> Recording:
             complete = complete or isinstance(record, Footer)
     except (McapError, ZstdError, struct.error, ValueError):
         complete = False  # cut off here, or not what was written
-    if contents.metadata is None:
+    if contents.metadata is None or not _KEYS <= contents.metadata.keys():
         raise TelemetryError(f"{path} is no recording of farhand, or ends before its first row")
     return Recording(
         contents.rows(),
@@ -256,9 +257,10 @@ class _Contents:
         if isinstance(record, Message):
             self._messages.setdefault(record.channel_id, []).append(record.data)
         elif isinstance(record, Schema):
-            self._schemas[record.id] = record
+            # The first is in a chunk with a checksum; its repetition at the end may be damaged.
+            self._schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
-            self._channels[record.id] = record
+            self._channels.setdefault(record.id, record)
         elif isinstance(record, Metadata) and record.name == METADATA:
             self.metadata = record.metadata
         elif isinstance(record, Attachment) and record.name == SESSION_FILE:
