@@ -135,5 +135,8 @@ class RecorderProcess:
                 why = self._ring.status.error or (
                     "it ended at once" if ended else f"it did not start within {_START_S:g} s"
                 )
-                raise TelemetryError(f"the flight recorder cannot record in {self.folder}: {why}")
+                raise TelemetryError(
+                    f"the flight recorder cannot record in {self.folder}: {why}; "
+                    "name another directory, or run with --no-record"
+                )
             time.sleep(_POLL_S)

@@ -3,6 +3,7 @@
 A file that ends anywhere is read up to its last whole chunk. Described in docs/recording.md.
 """
 
+import errno
 import os
 import struct
 from collections.abc import Mapping, Sequence
@@ -139,6 +140,8 @@ class _File:
         return self._length + len(self._buffer)
 
     def flush(self) -> None:
+        if os.fstat(self._descriptor).st_nlink == 0:
+            raise FileNotFoundError(errno.ENOENT, "the file being written was deleted")
         written = 0
         try:
             while written < len(self._buffer):
@@ -232,7 +235,7 @@ def _read(path: Path) -> Recording:
             complete = complete or isinstance(record, Footer)
     except (McapError, ZstdError, struct.error, ValueError):
         complete = False  # cut off here, or not what was written
-    if contents.metadata is None or not _KEYS <= contents.metadata.keys():
+    if contents.metadata is None or not contents.metadata.keys() >= _KEYS:
         raise TelemetryError(f"{path} is no recording of farhand, or ends before its first row")
     return Recording(
         contents.rows(),

@@ -203,9 +203,7 @@ def test_segments_join_and_gaps_are_located(tmp_path: Path) -> None:
 
 
 def test_segments_of_different_runs_do_not_join(tmp_path: Path) -> None:
-    paths = [
-        record(tmp_path / f"{epoch}.mcap", some_rows(3), epoch=epoch) for epoch in ("1", "2")
-    ]
+    paths = [record(tmp_path / f"{epoch}.mcap", some_rows(3), epoch=epoch) for epoch in ("1", "2")]
     with pytest.raises(TelemetryError, match="another run"):
         read_recording(*paths)
 
@@ -225,3 +223,16 @@ def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):
         RecordingWriter(path, source())
     assert len(read_recording(path)["remote"].rows) == 5
+
+
+def test_the_page_s_ten_lines_read_the_rows(tmp_path: Path) -> None:
+    rows = some_rows(77, 3, 2)
+    path = record(tmp_path / "rows.mcap", rows)
+    page = (Path(__file__).parents[2] / "docs" / "recording.md").read_text(encoding="utf-8")
+    [code] = [c for c in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "make_reader" in c]
+    code = code.replace('"rows.mcap"', repr(str(path))).replace("/local/", "/remote/")
+    names: dict[str, RowArray] = {}
+    exec(code, names)  # noqa: S102 - the page's own
+    assert names["rows"].dtype.names == rows.dtype.names
+    for name in COLUMNS:
+        assert names["rows"][name].tobytes() == rows[name].tobytes()

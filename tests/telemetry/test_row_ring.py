@@ -195,4 +195,4 @@ def assert_whole(rows: np.ndarray) -> None:
     assert (np.diff(sequence) == 1).all()
     for name in rows.dtype.names or ():
         if name != "sequence":
-            assert (rows[name].T == sequence % 250).all(), name
+            assert (sequence % 250 == rows[name].T).all(), name
