@@ -1,4 +1,4 @@
-"""The recorder: within this process, its disk made to fail; and as a process, killed and stopped."""
+"""The recorder: here, with its disk made to fail; and as a process, killed and stopped."""
 
 import errno
 import os
