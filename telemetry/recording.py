@@ -9,7 +9,6 @@ import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,8 +37,6 @@ METADATA: Final = "farhand"
 SESSION_FILE: Final = "session.toml"
 
 _KEYS: Final = frozenset({"site", "joints", "dimension", "wall_offset_ns"})
-_MAGIC_BYTES: Final = 8
-_RECORD: Final = struct.Struct("<BQ")  # opcode, bytes that follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,16 +220,15 @@ def _joined(parts: Sequence[Recording]) -> Recording:
 
 
 def _read(path: Path) -> Recording:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise TelemetryError(f"cannot read the recording {path}: {error}") from error
     contents = _Contents()
     complete = False
     try:
-        for record in StreamReader(BytesIO(_whole_records(data)), validate_crcs=True).records:
-            contents.take(record)
-            complete = complete or isinstance(record, Footer)
+        with path.open("rb") as file:
+            for record in StreamReader(file, validate_crcs=True).records:
+                contents.take(record)
+                complete = isinstance(record, Footer)
+    except OSError as error:
+        raise TelemetryError(f"cannot read the recording {path}: {error}") from error
     except (McapError, ZstdError, struct.error, ValueError):
         complete = False  # cut off here, or not what was written
     if contents.metadata is None or not contents.metadata.keys() >= _KEYS:
@@ -285,14 +281,3 @@ class _Contents:
                 return decode_rows(self.messages("/rows"), dtype)
         about = self.metadata or {}
         return np.zeros(0, row_dtype(int(about["joints"]), int(about["dimension"])))
-
-
-def _whole_records(data: bytes) -> bytes:
-    """Leave out a last record that was not written to its end."""
-    end = _MAGIC_BYTES
-    while end + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, end)
-        if opcode == 0 or end + _RECORD.size + length > len(data):
-            return data[:end]  # zeros are what a power failure leaves
-        end += _RECORD.size + length
-    return data

@@ -149,16 +149,16 @@ class RowRing:
         """Copy rows from number `first` on, in order; later ones if those are overwritten."""
         capacity = self.layout.capacity
         written = self.row_count
-        # The slot after the newest row may be half written.
-        start = max(first, written - capacity + 1)
+        start = max(first, written - capacity)
         rows = self.rows[np.arange(start, min(written, start + most)) % capacity]
+        # One more than was counted meanwhile: the next row may be half written.
         overwritten = self.row_count - capacity + 1 - start
         return rows[max(overwritten, 0) :]
 
     def events_from(self, first: int) -> tuple[list[SiteEvent], int]:
         """Copy the events from number `first` on; also the number of the next one."""
         written = self._counts[1]
-        start = max(first, written - EVENT_CAPACITY + 1)
+        start = max(first, written - EVENT_CAPACITY)
         events = [
             SiteEvent(
                 int(self._event_stamp_ns[i % EVENT_CAPACITY]),

@@ -86,7 +86,8 @@ class Disk:
         while self.stalled:
             time.sleep(0.005)
         if self.error is not None:
-            self._write(descriptor, data[: len(data) // 2])  # a disk fills up in mid-write
+            # A disk fills up in mid-write: here the chunk is whole, what follows it is not.
+            self._write(descriptor, data[:-10])
             raise OSError(self.error, os.strerror(self.error))
         return self._write(descriptor, data)
 

@@ -172,6 +172,17 @@ def test_a_file_cut_anywhere_is_read_to_its_last_whole_chunk(
         assert len(read) / len(rows) > cut / len(content) - 0.2
 
 
+def test_a_session_file_that_was_cut_is_not_taken_for_a_whole_one(
+    whole: tuple[Path, bytes, RowArray],
+) -> None:
+    path, content, _ = whole
+    start = content.index(b"format = 1")
+    damaged = path.with_name("damaged.mcap")
+    for cut in range(start, start + 30):
+        damaged.write_bytes(content[:cut])
+        assert read_recording(damaged)["remote"].session_text in ("", "format = 1\n# µ\n")
+
+
 def test_a_changed_byte_never_makes_other_rows(whole: tuple[Path, bytes, RowArray]) -> None:
     path, content, rows = whole
     known = {row.tobytes() for row in rows}
