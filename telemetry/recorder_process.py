@@ -18,7 +18,7 @@ BEHIND_ROWS: Final = 5000
 """Rows not yet on the disk from which on a recorder counts as behind."""
 
 _START_S: Final = 15.0
-_END_S: Final = 10.0
+_END_S: Final = 3.0  # less than the patience of whoever ends the site
 _POLL_S: Final = 2e-3
 
 
@@ -47,6 +47,7 @@ class RecorderProcess:
     def __init__(self, ring: RowRing, memory: SharedMemory, options: RecorderOptions) -> None:
         self.folder = options.folder
         self._ring = ring
+        self._closed = False
         root = str(Path(__file__).parents[1])
         paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
         self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -94,6 +95,8 @@ class RecorderProcess:
             troubles.append(f"not recording: {status.error}")
         elif ended and (self._process.returncode != 0 or behind):
             troubles.append(f"the recorder ended with code {self._process.returncode}")
+        elif self._closed and not ended:
+            troubles.append(f"the recorder still writes, {behind} rows are left")
         elif behind > BEHIND_ROWS:
             troubles.append(f"the recorder is {behind} rows behind")
         if status.lost:
@@ -105,6 +108,7 @@ class RecorderProcess:
     def close(self) -> None:
         """Tell it that the site has ended; wait until it has written all, but not for ever."""
         assert self._process.stdin is not None  # noqa: S101 - a pipe was asked for
+        self._closed = True
         with suppress(OSError):
             self._process.stdin.close()
         with suppress(subprocess.TimeoutExpired):

@@ -428,6 +428,20 @@ def test_a_recorder_that_is_held_up_is_reported_and_catches_up(run: Run, folder:
     assert recorded(folder).rows["sequence"].tolist() == list(range(6000))
 
 
+def test_an_end_does_not_wait_for_ever_and_what_is_left_is_written_later(
+    run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("telemetry.recorder_process._END_S", 0.2)
+    os.kill(run.recorder.pid, signal.SIGSTOP)
+    put(run.stream, 300)
+    run.stream.farewell(1)
+    run.recorder.close()
+    assert run.recorder.trouble == "the recorder still writes, 300 rows are left"
+    os.kill(run.recorder.pid, signal.SIGCONT)
+    until(lambda: run.recorder.trouble is None, "its end")
+    assert recorded(folder).rows["sequence"].tolist() == list(range(300))
+
+
 def test_where_nothing_can_be_written_the_start_says_so(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(TelemetryError, match=r"cannot record in .*file/below: .*Not a directory"):
