@@ -1,7 +1,7 @@
 """The session file: TOML that both sites read, as typed, frozen, validated values.
 
 Both sites must hold the same session. `Session.digest` says so: neither comments nor addresses
-nor a machine's real-time settings change it, every other key does.
+nor a machine's real-time settings and recordings change it, every other key does.
 """
 
 import hashlib
@@ -51,6 +51,7 @@ from site_runtime.session_settings import (
     PaperObstacleTask,
     Pulse,
     PulsesOperator,
+    RecorderSettings,
     RemoteSettings,
     SessionFile,
     StiffnessCoupling,
@@ -86,6 +87,7 @@ __all__ = [
     "Pulse",
     "PulsesOperator",
     "RealTimeSettings",
+    "RecorderSettings",
     "RemoteSettings",
     "Session",
     "SessionError",
@@ -117,6 +119,7 @@ PATH_KEYS = (
     *(f"{site}.robot.path" for site in ("local", "remote")),
     *(f"channel.{direction}.delay.path" for direction in DIRECTIONS),
     "network.zenoh_config",
+    "recorder.directory",
 )
 """The keys that name files, relative to the session file."""
 
@@ -170,7 +173,7 @@ def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
 def _digest(file: SessionFile) -> int:
     """64 bits over everything that both sites must agree on."""
     agreed = _plain(file)
-    for own in ("network", "real_time"):
+    for own in ("network", "real_time", "recorder"):
         del agreed[own]
     canonical = json.dumps(agreed, sort_keys=True, separators=(",", ":"))
     return int.from_bytes(hashlib.blake2b(canonical.encode(), digest_size=8).digest(), "little")

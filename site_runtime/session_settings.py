@@ -121,6 +121,14 @@ class NetworkSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class RecorderSettings:
+    """Where the flight recorder of this machine writes (None: the user's state), and how much."""
+
+    directory: str | None = None
+    keep_s: Positive = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
 class DampingSettings:
     """Λ = diag(joint) + Jᵀ diag(task) J."""
 
@@ -386,6 +394,7 @@ class SessionFile:
     engagement: EngagementSettings = EngagementSettings()
     channel: ChannelSettings = ChannelSettings()
     network: NetworkSettings = NetworkSettings()
+    recorder: RecorderSettings = RecorderSettings()
     local: LocalSettings
     remote: RemoteSettings
 

@@ -1,6 +1,7 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,3 +111,22 @@ def test_quiet_prints_nothing(fresh: Site, capsys: pytest.CaptureFixture[str]) -
     with StatusLine(fresh, quiet=True) as line:
         assert not line._thread.is_alive()
     assert capsys.readouterr().err == ""
+
+
+class TroubledRecorder:
+    folder = "/state/[demo]/local"
+    incidents = 2
+    trouble = "not recording: [Errno 28] No space left on device, 7 rows not recorded"
+
+
+def test_the_line_and_the_summary_say_what_the_recorder_could_not_do(fresh: Site) -> None:
+    recorder: Any = TroubledRecorder()
+    assert describe(fresh, 100.0, recorder).endswith(recorder.trouble)
+    console = Console(file=io.StringIO(), width=160)
+    summary(fresh, console, recorder)
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    assert recorder.trouble in text
+    assert "2 kept in /state/[demo]/local" in text
+    recorder.trouble = None
+    assert "record" not in describe(fresh, 100.0, recorder)
