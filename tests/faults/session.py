@@ -19,6 +19,7 @@ def write_session(
     lease_s: float,
     stiffness_n_per_m: float = STIFFNESS_N_PER_M,
     zenoh_config: Path | None = None,
+    operator: dict[str, object] | None = None,
 ) -> Path:
     """Write the session file of one site and return its path; endpoints come by command line."""
     document = tomlkit.parse((EXPERIMENTS / "demo.toml").read_text(encoding="utf-8")).unwrap()
@@ -31,6 +32,8 @@ def write_session(
     }
     document["coupling"]["stiffness_n_per_m"] = [stiffness_n_per_m] * 2
     document["coupling"]["force_ceiling_n"] = [CEILING_N] * 2
+    if operator is not None:
+        document["local"]["operator"] = operator
     document["network"]["lease_s"] = lease_s
     if zenoh_config is not None:
         document["network"]["zenoh_config"] = str(zenoh_config)
@@ -38,3 +41,20 @@ def write_session(
         del document["remote"][contact]
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
     return path
+
+
+def pulses(count: int, every_s: float = 10.0, push_s: float = 2.0) -> dict[str, object]:
+    """Return a hand that pushes now and then, to and fro along both axes, and lets go between."""
+    pushes = [("x", -6.0), ("y", 6.0), ("x", 6.0), ("y", -6.0)]
+    return {
+        "kind": "pulses",
+        "pulses": [
+            {
+                "axis": pushes[number % 4][0],
+                "force_n": pushes[number % 4][1],
+                "start_s": 2.0 + number * every_s,
+                "end_s": 2.0 + number * every_s + push_s,
+            }
+            for number in range(count)
+        ],
+    }

@@ -46,6 +46,7 @@ class Daemon:
     endpoint: str
     log: Path
     epoch: int = 0
+    killed_ns: int = 0
 
     def text(self) -> str:
         """The words it printed, without frames."""
@@ -60,14 +61,22 @@ class SitePair:
     """
 
     def __init__(
-        self, folder: Path, *, network: ImpairedNetwork | None = None, routed: bool = False
+        self,
+        folder: Path,
+        *,
+        network: ImpairedNetwork | None = None,
+        routed: bool = False,
+        operator: dict[str, object] | None = None,
+        orphan_s: float = ORPHAN_S,
     ) -> None:
         self._folder = folder
         self._network = network
+        self._operator = operator
+        self._orphan_s = orphan_s
         self._endpoints = {site: self._free_endpoint(site) for site in BOTH}
         self._router_endpoint = self._free_endpoint(LOCAL) if routed else None
         self._router: Companion | None = None
-        self._all: list[Daemon] = []
+        self.all: list[Daemon] = []
         self.daemons: dict[SiteId, Daemon] = {}
         self.clocks: dict[SiteId, WallClock] = {}
         if wall_clock.COMPILER is not None:
@@ -106,6 +115,7 @@ class SitePair:
             self._folder / f"{site.label}_{time.monotonic_ns()}.toml",
             lease_s=LAN_LEASE_S if self._network is None else WAN_LEASE_S,
             zenoh_config=config,
+            operator=self._operator,
             **changes,  # type: ignore[arg-type]
         )
 
@@ -136,6 +146,7 @@ class SitePair:
 
     def end(self, daemon: Daemon) -> None:
         """SIGKILL one daemon."""
+        daemon.killed_ns = daemon.killed_ns or time.monotonic_ns()
         daemon.process.kill()
         daemon.process.wait()
 
@@ -183,7 +194,14 @@ class SitePair:
             f"{site.label} leaves {state}",
         )
 
-    def until_steady(self) -> None:
+    def recorded(self, site: SiteId) -> list[Path]:
+        """Segments that the site's runs have recorded, in their order."""
+        folder = self._state_folder(site) / "farhand" / NAME / site.label
+        return sorted(
+            path for path in folder.glob("*.mcap") if not path.name.startswith("incident")
+        )
+
+    def until_steady(self, within_s: float = DEADLINE_S) -> None:
         """Wait until both have been ENGAGED on a loop younger than certified for half a second."""
 
         def steady(site: SiteId) -> bool:
@@ -192,11 +210,12 @@ class SitePair:
             fresh = rows["round_trip_s"] <= rows["certified_round_trip_s"]
             return len(rows) > 50 and bool((engaged & fresh).all())
 
-        self.until(lambda: all(map(steady, BOTH)), "both steadily ENGAGED on a fresh loop")
+        what = "both steadily ENGAGED on a fresh loop"
+        self.until(lambda: all(map(steady, BOTH)), what, within_s)
 
     def history(self) -> str:
         """What the daemons printed, for failures."""
-        ends = [(daemon, daemon.process.poll()) for daemon in self._all]
+        ends = [(daemon, daemon.process.poll()) for daemon in self.all]
         return "\n".join(
             f"{daemon.site.label} ({'running' if code is None else code}): {daemon.text()}"
             for daemon, code in ends
@@ -204,11 +223,11 @@ class SitePair:
 
     def crashed(self) -> list[Daemon]:
         """Daemons that ended by themselves."""
-        return [d for d in self._all if d.process.poll() not in (None, -signal.SIGKILL)]
+        return [d for d in self.all if d.process.poll() not in (None, -signal.SIGKILL)]
 
     def close(self) -> None:
         """Kill all that was started."""
-        for daemon in self._all:
+        for daemon in self.all:
             self.end(daemon)
         for companion in (*self._observers, *([self._router] if self._router else ())):
             companion.close()
@@ -223,7 +242,7 @@ class SitePair:
         elif site is LOCAL or dial_peer:
             dialled.append(self._endpoints[site.peer])
         command = self._command(
-            site, f"{site.label}_site", str(self.files[site]), "--duration", str(ORPHAN_S),
+            site, f"{site.label}_site", str(self.files[site]), "--duration", str(self._orphan_s),
             "--listen", endpoint, *(word for place in dialled for word in ("--connect", place)),
         )  # fmt: skip
         log = self._folder / f"{site.label}_{time.monotonic_ns()}.log"
@@ -233,20 +252,23 @@ class SitePair:
                 command,
                 cwd=ROOT,
                 env=os.environ
-                | {"XDG_STATE_HOME": str(self._folder / f"state_{site.label}")}
+                | {"XDG_STATE_HOME": str(self._state_folder(site))}
                 | (clock.environment if clock else {}),
                 stdin=subprocess.DEVNULL,
                 stdout=printed,
                 stderr=printed,
             )
         daemon = Daemon(site, process, endpoint, log)
-        self._all.append(daemon)
+        self.all.append(daemon)
         return daemon
+
+    def _state_folder(self, site: SiteId) -> Path:
+        return self._folder / f"state_{site.label}"
 
     def _identify(self, daemon: Daemon) -> None:
         """Wait for the daemon's first rows: their epoch is its name."""
         recording = self._recordings[daemon.site]
-        known = {other.epoch for other in self._all if other.site is daemon.site}
+        known = {other.epoch for other in self.all if other.site is daemon.site}
 
         def heard() -> bool:
             if daemon.process.poll() is not None:
