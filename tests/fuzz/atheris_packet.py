@@ -20,7 +20,7 @@ from channel.delay import ConstantDelay, Direction
 from channel.injection import Injection
 from channel.memory_link import memory_links
 from channel.packet import PacketError, decode
-from tests.fuzz.exchange import CAPACITY, DIMENSION, MS, Exchange, listener
+from tests.fuzz.exchange import CAPACITY, DIMENSION, MS, Exchange, knowledge, listener
 from tests.fuzz.layout import SIZES, example, reencoded, resealed
 from tests.fuzz.reference import reason_in_bytes
 
@@ -47,7 +47,7 @@ def check(data: bytes) -> None:
         now_ns = tick * MS
         sample = channel.latest(now_ns)
         assert sample is None or np.isfinite(sample.position_m).all()
-        _ = channel.offset, channel.one_way_ns
+        knowledge(channel)
         assert channel.send(now_ns, 2, rest, rest, rest)
     counters = channel.counters
     assert counters.received + counters.rejected.total() == len(parts)

@@ -4,6 +4,7 @@ The peer talks to two listeners of the same site and the same run. One hears the
 other hostile datagrams too: as long as they stay bit-equal, these have changed nothing.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,6 +20,11 @@ CLOCKS_APART_NS = 7_000_000_123
 SITE, PEER = 0, 1
 SESSION, DIMENSION = 0x5E55_1011_0123_4567, 2
 CAPACITY = 512
+_TOLD = [
+    name
+    for name, member in vars(Channel).items()
+    if isinstance(member, property) and name != "session_mismatch"
+]
 
 
 def listener(link: MemoryLink, site: int = SITE, **changes: Any) -> Channel:
@@ -50,16 +56,10 @@ def used(sample: PeerSample | None) -> tuple[object, ...] | None:
     )
 
 
-def knowledge(channel: Channel) -> tuple[object, ...]:
-    """All that a channel tells of its peer, but for what it rejected."""
-    return (
-        channel.heard_ns,
-        channel.heard_state,
-        channel.peer_confirmed,
-        channel.offset,
-        channel.one_way_ns,
-        replace(channel.counters, rejected=None),  # type: ignore[arg-type]
-    )
+def knowledge(channel: Channel) -> dict[str, object]:
+    """All that a channel tells of its peer, but for what it rejected, and for whose sake."""
+    told = {name: getattr(channel, name) for name in _TOLD}
+    return told | {"counters": replace(channel.counters, rejected=Counter())}
 
 
 class Exchange:

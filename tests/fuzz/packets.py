@@ -23,7 +23,7 @@ import numpy as np
 from channel.delay import ConstantDelay, Direction, SinusoidDelay
 from channel.memory_link import memory_links
 from channel.packet import Reject
-from tests.fuzz.exchange import CAPACITY, DIMENSION, PEER, SESSION, Exchange, listener
+from tests.fuzz.exchange import CAPACITY, DIMENSION, PEER, SESSION, Exchange, knowledge, listener
 from tests.fuzz.layout import example
 from tests.fuzz.mutations import mutated
 from tests.fuzz.reference import reason
@@ -73,7 +73,7 @@ class Victim:
         if sample is not None:
             assert np.isfinite([sample.position_m, sample.velocity_m_s, sample.force_n]).all()
             _ = sample.age_ns * 1e-9, (sample.round_trip_ns or 0) * 1e-9
-        _ = channel.offset, channel.one_way_ns, channel.heard_state, channel.peer_confirmed
+        knowledge(channel)
         rest = np.zeros(DIMENSION)
         assert channel.send(now_ns, 2, rest, rest, rest)
         self._sender.receive()
