@@ -156,8 +156,8 @@ class TelemetryStream:
     ) -> None:
         """Write one row into the ring; real-time safe. Fields as in `COLUMNS`.
 
-        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. The counters
-        stay at the most that they hold. A row whose assignment raises (a wrong shape) is not
+        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A counter
+        stays at the most that it holds. A row whose assignment raises (a wrong shape) is not
         counted.
         """
         i = self._count % self._capacity
