@@ -115,7 +115,7 @@ class Session(SessionFile):
 
 
 _MOST_TEXT = 100_000
-_MOST_LINE = 10_000
+_MOST_LINE = 2_000
 _ADAPTER = TypeAdapter(SessionFile)
 PATH_KEYS = (
     *(f"{site}.robot.path" for site in ("local", "remote")),

@@ -196,7 +196,7 @@ def _explain_one(detail: Mapping[str, Any], annotation: object, value: object) -
         for inner in cause.problems:
             yield Problem(f"{key}{inner.key}", inner.value, inner.reason)
     elif cause is not None:
-        yield Problem(key, ABSENT if isinstance(value, dict) else value, str(cause))
+        yield Problem(key or "the file", ABSENT if isinstance(value, dict) else value, str(cause))
     elif annotation is None or not key:
         yield Problem(key or "the file", value if key else ABSENT, detail["msg"])
     else:

@@ -56,18 +56,30 @@ HOSTILE: list[tuple[str, Reject, Make]] = [
     ("my own words", Reject.SITE, lambda _, __, said: said[-1]),
     ("another run", Reject.EPOCH, lambda new, *_: ahead(new, epoch=7)),
     ("no run at all", Reject.EPOCH, lambda new, *_: ahead(new, epoch=0)),
-    ("another run that answers nobody", Reject.EPOCH, lambda new, *_: ahead(new, epoch=7, echo_epoch=0)),
+    (
+        "another run that answers nobody",
+        Reject.EPOCH,
+        lambda new, *_: ahead(new, epoch=7, echo_epoch=0),
+    ),
     ("the newest again", Reject.DUPLICATE, lambda new, *_: new),
     ("the newest, other words", Reject.DUPLICATE, lambda new, *_: with_vectors(new, 9.0)),
     ("the newest, the last stamp", Reject.DUPLICATE, lambda new, *_: forged(new, stamp_ns=MOST)),
     ("the first again", Reject.OUT_OF_ORDER, lambda _, heard, __: heard[0]),
     ("one of a moment ago", Reject.OUT_OF_ORDER, lambda _, heard, __: heard[-5]),
     ("sequence 0", Reject.OUT_OF_ORDER, lambda new, *_: ahead(new, sequence=0)),
-    ("an old one stamped anew", Reject.OUT_OF_ORDER, lambda _, heard, __: forged(heard[-9], stamp_ns=MOST)),
+    (
+        "an old one stamped anew",
+        Reject.OUT_OF_ORDER,
+        lambda _, heard, __: forged(heard[-9], stamp_ns=MOST),
+    ),
     ("the stamp again", Reject.STAMP, lambda new, *_: forged(new, sequence=2**40)),
     ("the least stamp", Reject.STAMP, lambda new, *_: ahead(new, stamp_ns=LEAST)),
     ("stamp -1", Reject.STAMP, lambda new, *_: ahead(new, stamp_ns=-1)),
-    ("the last sequence, an old stamp", Reject.STAMP, lambda new, *_: ahead(new, sequence=2**64 - 1, stamp_ns=0)),
+    (
+        "the last sequence, an old stamp",
+        Reject.STAMP,
+        lambda new, *_: ahead(new, sequence=2**64 - 1, stamp_ns=0),
+    ),
     ("NaN", Reject.NON_FINITE, lambda new, *_: with_vectors(ahead(new), math.nan)),
     ("infinity", Reject.NON_FINITE, lambda new, *_: with_vectors(ahead(new), -math.inf)),
     ("three dimensions", Reject.DIMENSION, lambda new, *_: example(3, **fields_of(ahead(new)))),
@@ -76,7 +88,7 @@ HOSTILE: list[tuple[str, Reject, Make]] = [
     ("nothing", Reject.LENGTH, lambda *_: b""),
     ("something else", Reject.MAGIC, lambda *_: b"GET / HTTP/1.1\r\n" * 8),
     ("another version", Reject.VERSION, lambda new, *_: resealed(overwritten(new, 4, b"\xff"))),
-]  # fmt: skip
+]
 ALONE = [pytest.param(why, make, id=name) for name, why, make in HOSTILE]
 
 

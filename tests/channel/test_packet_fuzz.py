@@ -39,7 +39,6 @@ def outcome(data: bytes) -> Reject | None:
     try:
         packet = decode(data)
     except PacketError as error:
-        assert str(error).startswith(error.reason.value)
         return error.reason
     assert reencoded(packet) == data
     return None
@@ -61,7 +60,7 @@ def test_the_fields_fill_the_header() -> None:
     while place < VECTORS_OFFSET:
         place = ends[place]
     assert place == VECTORS_OFFSET
-    assert SIZES == {z: VECTORS_OFFSET + 24 * z + CHECKSUM.size for z in SIZES}
+    assert {z: VECTORS_OFFSET + 24 * z + CHECKSUM.size for z in SIZES} == SIZES
 
 
 @settings(deadline=None)
