@@ -90,8 +90,7 @@ class Exchange:
 
     def speak(self) -> None:
         """Begin a tick: let the peer say its packet, now the last of `heard`."""
-        self._tick += 1
-        self.now_ns = self._tick * MS
+        self._move_on()
         angle = 1e-3 * self._tick
         position = np.array([np.cos(angle), np.sin(angle)])
         now_ns = self.now_ns + self._ahead_ns
@@ -105,13 +104,24 @@ class Exchange:
 
         AssertionError if the two listeners then differ in anything but what they rejected.
         """
-        fresh = self.heard[-1]
-        for data in (*before, fresh, *after):
+        self._listen([*before, self.heard[-1], *after], self.heard[-1:])
+
+    def wait(self, hostile: Sequence[bytes]) -> None:
+        """One tick in which the peer says nothing, and the shaken listener hears others only."""
+        self._move_on()
+        self._listen(hostile, ())
+
+    def _move_on(self) -> None:
+        self._tick += 1
+        self.now_ns = self._tick * MS
+
+    def _listen(self, shaken: Sequence[bytes], quiet: Sequence[bytes]) -> None:
+        for data in shaken:
             assert self._to_shaken.send(data)
-        assert self._to_quiet.send(fresh)
+        for data in quiet:
+            assert self._to_quiet.send(data)
         self.sample = self.quiet.latest(self.now_ns)
-        shaken = self.shaken.latest(self.now_ns)
-        assert used(shaken) == used(self.sample)
+        assert used(self.shaken.latest(self.now_ns)) == used(self.sample)
         assert knowledge(self.shaken) == knowledge(self.quiet)
         assert not self.quiet.counters.rejected
         self._listeners_say()

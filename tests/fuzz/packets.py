@@ -31,6 +31,7 @@ from tests.fuzz.reference import reason
 BATCH = 256
 POOL = 64
 FROM_FRESH = 0.5  # of the mutated: the older a packet, the sooner it is out of order
+ALONE = 0.5  # of the batches end in a tick without the peer: nothing genuine hides a change
 NEW_VICTIM = 0.1  # chance a tick: a lasting one stays misled, a new one is misled otherwise
 SETTINGS: tuple[dict[str, Any], ...] = (
     {},
@@ -112,7 +113,12 @@ def _run(count: int, rng: Random, settings: dict[str, Any], tally: Tally) -> Non
         if rng.random() < NEW_VICTIM:
             victim = Victim(settings)
         try:
-            exchange.listen(*hostile)
+            before, after = hostile
+            if rng.random() < ALONE:
+                exchange.listen(before)
+                exchange.wait(after)
+            else:
+                exchange.listen(before, after)
             assert exchange.shaken.counters.rejected == rejected
             victim.hear(exchange.now_ns, [*batch, fresh])
         except Exception as failure:
