@@ -114,6 +114,8 @@ class Session(SessionFile):
         return self.local if identity is SiteId.LOCAL else self.remote
 
 
+_MOST_TEXT = 100_000
+_MOST_LINE = 2_000
 _ADAPTER = TypeAdapter(SessionFile)
 PATH_KEYS = (
     *(f"{site}.robot.path" for site in ("local", "remote")),
@@ -136,6 +138,7 @@ def load_session(path: Path | str) -> Session:
 
 def parse_session(text: str, path: Path) -> Session:
     """Validate a session file's text; paths in it are relative to the folder of `path`."""
+    _require_size(text, path)
     try:
         document = tomllib.loads(text)
         _resolve_paths(document, path.resolve().parent)
@@ -157,6 +160,15 @@ def parse_session(text: str, path: Path) -> Session:
         raise SessionFileError(path, numbered)
     keys = {item.name: getattr(file, item.name) for item in fields(file)}
     return Session(**keys, path=path, text=text, digest=digest)
+
+
+def _require_size(text: str, path: Path) -> None:
+    """Refuse what no session needs: a dotted key of n parts costs tomllib n² bytes and more."""
+    longest = max(map(len, text.splitlines()), default=0)
+    for length, most, what in ((len(text), _MOST_TEXT, "it"), (longest, _MOST_LINE, "a line")):
+        if length > most:
+            reason = f"{what} has {length} characters; a session file has at most {most}"
+            raise SessionFileError(path, [Problem("the file", ABSENT, reason)])
 
 
 def _resolve_paths(document: dict[str, Any], folder: Path) -> None:

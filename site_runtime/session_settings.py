@@ -104,7 +104,7 @@ class ChannelSettings:
     """Delay injection, and how often a site sends (None: every tick)."""
 
     injection: Literal["exact", "added", "off"] = "off"
-    send_rate_hz: Annotated[int, Field(ge=1)] | None = None
+    send_rate_hz: Annotated[int, Field(ge=1, le=MOST_HZ)] | None = None
     local_to_remote: Direction = field(default_factory=_no_delay)
     remote_to_local: Direction = field(default_factory=_no_delay)
 

@@ -16,6 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 MAGIC: Final = b"FHTB"
 MAX_BATCH_ROWS: Final = 10_000
 RING_BATCHES: Final = 240  # at 1 kHz, 12 s for a recorder that is held up
+_MOST: Final = 2**32 - 1  # that a counter's column holds
 FAREWELL: Final = "farewell"
 """The last event of a site that ended in good order."""
 
@@ -155,8 +156,9 @@ class TelemetryStream:
     ) -> None:
         """Write one row into the ring; real-time safe. Fields as in `COLUMNS`.
 
-        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A row whose
-        assignment raises (a wrong shape) is not counted.
+        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A counter
+        stays at the most that it holds. A row whose assignment raises (a wrong shape) is not
+        counted.
         """
         i = self._count % self._capacity
         self._sequence[i] = self._count
@@ -185,10 +187,10 @@ class TelemetryStream:
         self._link_distance_m[i] = link_distance_m
         self._midpoint_distance_m[i] = midpoint_distance_m
         self._sub_task_error_rad_s[i] = sub_task_error_rad_s
-        self._lost[i] = lost
-        self._late[i] = late
-        self._rejected[i] = rejected
-        self._missed[i] = missed
+        self._lost[i] = min(lost, _MOST)
+        self._late[i] = min(late, _MOST)
+        self._rejected[i] = min(rejected, _MOST)
+        self._missed[i] = min(missed, _MOST)
         self._count += 1
         self._count_row(self._count)
 
