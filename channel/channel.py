@@ -220,7 +220,7 @@ class Channel:
         if mine_ns == NO_AGE or self._newest is None or not self.peer_confirmed:
             return None
         theirs_ns = self._newest.greatest_age_ns
-        return None if theirs_ns == NO_AGE else mine_ns + theirs_ns
+        return None if theirs_ns == NO_AGE else max(0, mine_ns + theirs_ns)
 
     @property
     def peer_present(self) -> bool:

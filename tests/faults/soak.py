@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -192,7 +192,12 @@ class Soak:
         self.network.impair(impairment)
         time.sleep(for_s)
         self.network.impair(CLEAR)
-        return f"{impairment} for {for_s:.2f} s"
+        told = ", ".join(
+            f"{name} {value:.3g}"
+            for name, value in asdict(impairment).items()
+            if not isinstance(value, bool) and value
+        )
+        return f"{told} for {for_s:.2f} s".strip()
 
     def _bad_network(self) -> str:
         draw = self.draw.uniform
