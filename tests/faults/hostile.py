@@ -100,6 +100,7 @@ def nonsense(seed: int, site: SiteId, digest: int) -> Iterator[bytes]:
             echo_stamp_ns=now_ns,
             echo_arrival_ns=now_ns,
             used_stamp_ns=now_ns,
+            greatest_age_ns=0,
             vectors=np.array([[0.3, 0.3], [0.0, 0.0], [0.0, 0.0]]),
         )
         spoilt = bytearray(valid)
