@@ -29,7 +29,7 @@ class GreatestAge:
             stale = now_ns - self._since_ns >= WINDOW_NS
             self._before_ns = NO_AGE if stale else self._current_ns
             self._current_ns = NO_AGE
-            self._since_ns = now_ns
+            self._since_ns = now_ns if stale else self._since_ns + WINDOW_NS // 2
         if age_ns > self._current_ns:
             self._current_ns = min(age_ns, _MOST_NS)
 

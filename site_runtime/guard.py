@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
-from math import inf, isfinite
+from math import inf, isfinite, sqrt
 
 import numpy as np
 import numpy.typing as npt
 
 from hardware.interface import DeviceState, JointStops
 from hardware.robot_model import RobotTerms
+from site_runtime.half_spaces import nearest_not_along
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,6 +30,8 @@ class Cut(IntFlag):
     KINETIC_ENERGY = 16
     JOINT = 32
 
+
+Forbidden = tuple[Cut, FloatArray]
 
 _EXCESS = Cut.TORQUE | Cut.VELOCITY | Cut.TORQUE_RATE | Cut.KINETIC_ENERGY
 """Cuts that a sound session makes for moments only; a hand may lean on the others for ever."""
@@ -61,21 +64,22 @@ class Guard:
         self._box_m = list(
             zip(limits.workspace_min_m.tolist(), limits.workspace_max_m.tolist(), strict=True)
         )
-        self._bounds = list(
-            zip(limits.torque_nm.tolist(), limits.velocity_rad_s.tolist(), strict=True)
-        )
-        self._period_s = period_s
+        self._strongest_nm = limits.torque_nm.tolist()
+        self._fastest_rad_s = limits.velocity_rad_s.tolist()
+        self._axes = np.eye(len(self._fastest_rad_s))
         self._largest_step_nm = limits.torque_rate_nm_s * period_s
         self._limits_rate = bool(np.isfinite(limits.torque_rate_nm_s).any())
         self._stops = list(_sides(limits.stops))
-        self._excess_s = 0.0
+        # a part of a tick more, for what rounding takes
+        self._most_excess_ticks = limits.fault_after_s / period_s + 1e-6
+        self._excess_ticks = 0
         self._before_nm = np.zeros_like(limits.torque_nm)
         self.cut = Cut.NONE
         self.counts = {cut: 0 for cut in Cut if cut}
 
     def restart(self) -> None:
         """Begin anew with the outputs: at zero torque but gravity's, no excess counted."""
-        self._excess_s = 0.0
+        self._excess_ticks = 0
         self._before_nm = np.zeros_like(self._before_nm)
 
     def reading(self, reading: DeviceState) -> None:
@@ -108,92 +112,107 @@ class Guard:
         """
         if not _finite(torque_nm):
             raise GuardError(f"commanded torque {torque_nm} N·m is not finite")
-        q_dot, gravity_nm = terms.q_dot, terms.G
         limited = torque_nm
         if self._limits_rate:
-            limited = self._within_rate(limited - gravity_nm) + gravity_nm
-        too_fast = not all(
-            abs(torque) <= strongest and abs(speed) <= fastest
-            for torque, speed, (strongest, fastest) in zip(
-                limited.tolist(), q_dot.tolist(), self._bounds, strict=True
-            )
-        )
-        if too_fast:
-            limited = self._within_velocity(limited, q_dot, gravity_nm)
-        if self._limits.kinetic_energy_j < inf:
-            limited = self._within_energy(limited, terms)
-        for inward, bound_rad in self._stops:
-            limited = self._within_stop(limited, terms, inward, bound_rad)
-        if too_fast or self.cut:
-            limited = self._within_strength(limited)
+            limited = self._within_rate(limited, terms.G)
+        forbidden = self._forbidden(terms)
+        if forbidden:
+            limited = self._not_along(forbidden, limited, terms.G)
+        limited = self._within_strength(limited, forbidden, terms.G)
         if self._limits_rate:
-            self._before_nm = limited - gravity_nm
+            self._before_nm = limited - terms.G
         self._tally()
         return limited
 
-    def _within_rate(self, net_nm: FloatArray) -> FloatArray:
-        step = self._largest_step_nm
-        slow = np.clip(net_nm, self._before_nm - step, self._before_nm + step)
-        if (slow != net_nm).any():
-            self._count(Cut.TORQUE_RATE)
-        return slow
+    def _within_rate(self, torque_nm: FloatArray, gravity_nm: FloatArray) -> FloatArray:
+        net_nm, step_nm = torque_nm - gravity_nm, self._largest_step_nm
+        slow_nm = np.clip(net_nm, self._before_nm - step_nm, self._before_nm + step_nm)
+        if (slow_nm == net_nm).all():
+            return torque_nm
+        self._count(Cut.TORQUE_RATE)
+        return gravity_nm + slow_nm
 
-    def _within_velocity(
-        self, torque_nm: FloatArray, q_dot: FloatArray, gravity_nm: FloatArray
+    def _forbidden(self, terms: RobotTerms) -> list[Forbidden]:
+        """Return along which directions, of length 1, no torque but gravity's may act now."""
+        limits, q_dot = self._limits, terms.q_dot
+        found = [
+            (Cut.VELOCITY, self._axes[joint] if speed > 0.0 else -self._axes[joint])
+            for joint, (speed, fastest) in enumerate(
+                zip(q_dot.tolist(), self._fastest_rad_s, strict=True)
+            )
+            if abs(speed) > fastest
+        ]
+        if (
+            limits.kinetic_energy_j < inf
+            and 0.5 * float(q_dot @ terms.M @ q_dot) > limits.kinetic_energy_j
+        ):
+            found.append((Cut.KINETIC_ENERGY, q_dot / sqrt(q_dot @ q_dot)))
+        for outward, bound_rad in self._stops:
+            if float(outward @ terms.q) >= bound_rad:
+                found.append((Cut.JOINT, outward))
+        return found
+
+    def _not_along(
+        self, forbidden: list[Forbidden], torque_nm: FloatArray, gravity_nm: FloatArray
     ) -> FloatArray:
-        speeding_up = (np.abs(q_dot) > self._limits.velocity_rad_s) & (
-            (torque_nm - gravity_nm) * q_dot > 0.0
-        )
-        if not speeding_up.any():
+        """Take away, all at once, what acts along the forbidden directions."""
+        net_nm = torque_nm - gravity_nm
+        cut = Cut.NONE
+        for limit, direction in forbidden:
+            if float(direction @ net_nm) > 0.0:
+                cut |= limit
+        if not cut:
             return torque_nm
-        self._count(Cut.VELOCITY)
-        return np.where(speeding_up, gravity_nm, torque_nm)
+        self._count(cut)
+        free_nm = nearest_not_along(net_nm, np.array([direction for _, direction in forbidden]))
+        # what is left alone is left as it was, without rounding
+        return np.where(free_nm == net_nm, torque_nm, gravity_nm + free_nm)
 
-    def _within_energy(self, torque_nm: FloatArray, terms: RobotTerms) -> FloatArray:
-        """Above the limit, take away what feeds the motion: ½ q̇ᵀMq̇ rises by no torque of ours."""
-        q_dot = terms.q_dot
-        power_w = float((torque_nm - terms.G) @ q_dot)
-        if power_w <= 0.0 or 0.5 * float(q_dot @ terms.M @ q_dot) <= self._limits.kinetic_energy_j:
-            return torque_nm
-        self._count(Cut.KINETIC_ENERGY)
-        return torque_nm - (power_w / float(q_dot @ q_dot)) * q_dot
-
-    def _within_stop(
-        self, torque_nm: FloatArray, terms: RobotTerms, outward: FloatArray, bound_rad: float
+    def _within_strength(
+        self, torque_nm: FloatArray, forbidden: list[Forbidden], gravity_nm: FloatArray
     ) -> FloatArray:
-        """At or beyond a stop, take away what pushes along `outward`, its row of A."""
-        if float(outward @ terms.q) < bound_rad:
-            return torque_nm
-        push_nm = float((torque_nm - terms.G) @ outward) / float(outward @ outward)
-        if push_nm <= 0.0:
-            return torque_nm
-        self._count(Cut.JOINT)
-        return torque_nm - push_nm * outward
-
-    def _within_strength(self, torque_nm: FloatArray) -> FloatArray:
-        strongest = self._limits.torque_nm
-        if (np.abs(torque_nm) <= strongest).all():
+        """Cut joint by joint; but all alike where one joint's cut would leave another's unheld."""
+        if all(
+            abs(torque) <= strongest
+            for torque, strongest in zip(torque_nm.tolist(), self._strongest_nm, strict=True)
+        ):
             return torque_nm
         self._count(Cut.TORQUE)
-        return np.clip(torque_nm, -strongest, strongest)
+        strongest_nm = self._limits.torque_nm
+        cut_nm = np.clip(torque_nm, -strongest_nm, strongest_nm)
+        net_nm = cut_nm - gravity_nm
+        if all(float(direction @ net_nm) <= 0.0 for _, direction in forbidden):
+            return cut_nm
+        net_nm = torque_nm - gravity_nm
+        room_nm = np.maximum(strongest_nm - np.copysign(1.0, net_nm) * gravity_nm, 0.0)
+        share = min(
+            (
+                room / abs(net)
+                for room, net in zip(room_nm.tolist(), net_nm.tolist(), strict=True)
+                if abs(net) > room
+            ),
+            default=1.0,
+        )
+        all_alike_nm: FloatArray = np.clip(gravity_nm + share * net_nm, -strongest_nm, strongest_nm)
+        return all_alike_nm
 
     def _tally(self) -> None:
         """Let the excess grow by each tick that was cut, and shrink by each that was not."""
         if not self.cut & _EXCESS:
-            if self._excess_s > 0.0:
-                self._excess_s = max(0.0, self._excess_s - self._period_s)
+            self._excess_ticks = max(0, self._excess_ticks - 1)
             return
-        self._excess_s += self._period_s
-        if self._excess_s > self._limits.fault_after_s:
+        self._excess_ticks += 1
+        if self._excess_ticks > self._most_excess_ticks:
             cut = self.cut & _EXCESS
             raise GuardError(
                 f"commands were cut for {self._limits.fault_after_s:g} s, the last one by the "
                 f"limits of {cut_names(cut)}: the gains or the limits are wrong, or the robot is"
             )
 
-    def _count(self, cut: Cut) -> None:
-        self.cut |= cut
-        self.counts[cut] += 1
+    def _count(self, cuts: Cut) -> None:
+        self.cut |= cuts
+        for cut in cuts:
+            self.counts[cut] += 1
 
 
 def cut_names(cuts: Cut) -> str:
@@ -202,11 +221,12 @@ def cut_names(cuts: Cut) -> str:
 
 
 def _sides(stops: JointStops) -> Iterator[tuple[FloatArray, float]]:
-    """Yield each finite bound as (outward row, greatest value along it)."""
+    """Yield each finite bound as (outward row of length 1, greatest value along it)."""
     for row, low, high in zip(stops.matrix, stops.lower_rad, stops.upper_rad, strict=True):
+        length = float(np.linalg.norm(row))
         for outward, bound_rad in ((row, high), (-row, -low)):
             if isfinite(bound_rad):
-                yield outward, float(bound_rad)
+                yield outward / length, float(bound_rad) / length
 
 
 def _finite(values: FloatArray) -> bool:

@@ -24,10 +24,14 @@ class OperatorRequests:
 
     def take_emergency_stop(self) -> bool:
         """Whether it was asked for since the last call."""
-        asked, self._emergency_stop = self._emergency_stop, False
-        return asked
+        if not self._emergency_stop:
+            return False
+        self._emergency_stop = False  # after the look: one asked for in between is not lost
+        return True
 
     def take_reset(self) -> bool:
         """Whether it was asked for since the last call."""
-        asked, self._reset = self._reset, False
-        return asked
+        if not self._reset:
+            return False
+        self._reset = False
+        return True

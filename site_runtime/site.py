@@ -91,7 +91,7 @@ class Site:
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
         self._late_ticks = 0
-        self._position_m = np.zeros(robot.task_dimension)
+        self._told_m = np.zeros(robot.task_dimension)
 
     @property
     def state(self) -> State:
@@ -132,6 +132,7 @@ class Site:
         if self._supervisor.state in STOPPED:
             self._tick_stopped(now_ns, lateness_ns)
             return
+        self.requests.take_reset()  # asked for too early: it must not undo a stop to come
         try:
             reading = self._device.read()
             self.guard.reading(reading)
@@ -147,8 +148,8 @@ class Site:
                 torque_nm = self.guard.torque(command.torque_nm, terms)
                 self._device.write(torque_nm)
             force_n = reading.wrench[: self._robot.task_dimension]
-            told_m = self._supervisor.told_m(terms.X)
-            self.channel.send(now_ns, state, told_m, terms.X_dot, force_n)
+            self._told_m = self._supervisor.told_m(terms.X)
+            self.channel.send(now_ns, state, self._told_m, terms.X_dot, force_n)
             self._put(now_ns, lateness_ns, reading, peer, terms, command, torque_nm, share)
         except Exception as failure:
             self._device.stop()
@@ -213,15 +214,18 @@ class Site:
             state=self._supervisor.state,
         )
         self.ticks += 1
+        self.requests.take_emergency_stop()  # it is stopped already
         if self.requests.take_reset():
             self._reset(now_ns)
 
     def _reset(self, now_ns: int) -> None:
-        """Open the device anew, outputs off; it may take its time. A fault again if it fails."""
-        self._device.close()
+        """Open the device anew, outputs off; it may take its time. A fault if it fails."""
         try:
+            self._device.close()
             self._device.open()
         except Exception as failure:
+            self._device.stop()
+            self._supervisor.fault()
             self.failure = failure
             self.telemetry.event(now_ns, f"FAULT: {type(failure).__name__}: {failure}")
             return
@@ -232,7 +236,7 @@ class Site:
 
     def _say(self, now_ns: int) -> None:
         rest = np.zeros(self._robot.task_dimension)
-        self.channel.send(now_ns, self._supervisor.state, self._position_m, rest, rest)
+        self.channel.send(now_ns, self._supervisor.state, self._told_m, rest, rest)
 
     def _put(
         self,
@@ -246,7 +250,6 @@ class Site:
         share: float,
     ) -> None:
         """Write this tick's row."""
-        self._position_m = terms.X
         target_m = self._supervisor.target_m
         trip_ns = None if peer is None else peer.round_trip_ns
         self.round_trip_s = nan if trip_ns is None else trip_ns * 1e-9

@@ -12,7 +12,7 @@ from rich.text import Text
 from channel.packet import Reject
 from site_runtime.guard import cut_names
 from site_runtime.site import Site
-from site_runtime.supervisor import State
+from site_runtime.supervisor import Cause, State
 from telemetry.recorder_process import RecorderProcess
 
 LIVE_INTERVAL_S = 0.5
@@ -70,7 +70,7 @@ def describe(site: Site, rate_hz: float, recorder: RecorderProcess | None = None
     parts = [f"{site.identity.label:6} {site.state.name:8} {rate_hz:6.0f} Hz"]
     if site.state is not State.ENGAGED:
         parts.append(site.cause.value)
-    if site.state is State.ALIGNING:
+    if site.cause is Cause.APART:
         parts.append(f"{site.apart_m * 1e3:.0f} mm")
     if not isnan(round_trip_ms):
         parts.append(f"round trip {round_trip_ms:6.1f} ms")

@@ -6,12 +6,13 @@
 | READY | ALIGNING | the same, but the points are further apart |
 | ALIGNING | READY | peer no longer agrees |
 | ENGAGED | HOLD | peer silent for `hold_after`, offline, stopped, or started anew |
+| ENGAGED | HOLD | the outputs of a peer that drove go off |
 | ENGAGED | HOLD | this site stalled for `hold_after`, or its ticks come late one after the other |
 | ENGAGED | HOLD | the loop is older than what `derate_to` of the gains is proven for |
-| HOLD | ENGAGED | all of that is over; a peer that was started anew must be aligned again |
-| HOLD | READY | after `stop_after` |
+| HOLD | ENGAGED | all of that is over; a peer that engaged anew meanwhile drives, and is aligned |
+| HOLD | READY | after `stop_after`; in its last `release` nothing leads back |
 | ENGAGED, HOLD | RELEASED | the local operator opens the clutch |
-| RELEASED | ENGAGED, HOLD | the clutch is closed again; HOLD if the peer does not agree |
+| RELEASED | ENGAGED, HOLD | the clutch is closed again; HOLD where HOLD would not end |
 | any but FAULT | EMERGENCY_STOP | its operator says so; in all but READY, the peer is in it |
 | any | FAULT | any exception |
 | FAULT, EMERGENCY_STOP | READY | reset by this site's operator |
@@ -66,6 +67,7 @@ class Cause(Enum):
     SILENT = "the peer is silent"
     PEER_UNFIT = "the peer is offline or stopped"
     PEER_ANEW = "the peer was started anew"
+    PEER_OFF = "the peer's outputs are off"
     STALLED = "this site stalled"
     LATE = "the ticks of this site come late, one after the other"
     MARGIN = "the loop is older than the gains are proven for"
@@ -135,12 +137,14 @@ class Supervisor:
         self._coupled_ns = 0
         self._held_ns = 0
         self._released_ns = 0
+        self._released_share = 0.0
         self._updated_ns: int | None = None
         self._resumed_ns: int | None = None
         self._held: FloatArray | None = None
         self._told_m = np.zeros(dimension)
         self._peer_restarts = 0
         self._peer_anew = False
+        self._peer_drove = False
         self._scale = self._proven = 1.0
         self.state = State.READY
         self.cause = Cause.NO_PEER
@@ -175,7 +179,7 @@ class Supervisor:
         elif self._peer_says_stop(presence):
             self._go(State.EMERGENCY_STOP, Cause.PEER_STOP)
         elif self.state in _OUTPUTS_OFF:
-            self._wait(now_ns, peer, own_m, trouble)
+            self._wait(now_ns, presence, peer, own_m, trouble)
         elif clutch and self.state is not State.RELEASED:
             self._release(now_ns, own_m)
         elif self.state is State.ENGAGED and trouble is not None:
@@ -183,7 +187,7 @@ class Supervisor:
         elif self.state is State.HOLD:
             self._try_to_resume(now_ns, presence, peer, own_m, trouble)
         elif self.state is State.RELEASED:
-            self._follow_the_hand(now_ns, own_m, clutch, trouble)
+            self._follow_the_hand(now_ns, presence, peer, own_m, clutch, trouble)
         self._move_scale(now_ns)
         self._updated_ns = now_ns
         if self.state is State.ENGAGED and peer is not None:
@@ -205,10 +209,10 @@ class Supervisor:
         and before a HOLD that has lasted too long ends.
         """
         rules = self._rules
+        if self.state is State.RELEASED:
+            return self._released_share * (1.0 - self._gone(now_ns - self._released_ns))
         share, _ = smooth_ramp((now_ns - self._coupled_ns) * 1e-9, rules.ramp_s)
         share *= self._scale
-        if self.state is State.RELEASED:
-            return share * (1.0 - self._gone(now_ns - self._released_ns))
         if self.state is State.HOLD:
             return share * (1.0 - self._gone(round(rules.release_s * 1e9) - self._left_ns(now_ns)))
         return share
@@ -218,7 +222,7 @@ class Supervisor:
         self._go(State.FAULT, Cause.FAILURE)
 
     def reset(self) -> None:
-        """Leave FAULT or EMERGENCY_STOP for READY, everything forgotten."""
+        """Leave FAULT or EMERGENCY_STOP for READY; of what was, only the offset stays."""
         if self.state in STOPPED:
             self._go(State.READY, Cause.RESET)
             self.target_m = self._held = self._resumed_ns = None
@@ -243,7 +247,9 @@ class Supervisor:
         rules = self._rules
         anew = presence.counters.peer_restarts != self._peer_restarts
         self._peer_restarts = presence.counters.peer_restarts
-        self._peer_anew = self._peer_anew or anew
+        off = self._peer_drove and presence.heard_state in _OUTPUTS_OFF
+        self._peer_drove = presence.heard_state in DRIVEN
+        self._peer_anew = self._peer_anew or anew or off
         heard_ns, before_ns = presence.heard_ns, self._updated_ns
         # after a stall of this site itself the peer's point is elsewhere: hold, then blend
         if before_ns is not None and now_ns - before_ns > rules.hold_after_ns:
@@ -252,10 +258,11 @@ class Supervisor:
             return Cause.NO_PEER
         if now_ns - heard_ns > rules.hold_after_ns:
             return Cause.SILENT
-        if presence.heard_state not in _PEER_FIT:
+        # the sample in use is older than the state heard, perhaps from before a reset
+        if presence.heard_state not in _PEER_FIT or peer.state not in _PEER_FIT:
             return Cause.PEER_UNFIT
-        if anew:
-            return Cause.PEER_ANEW
+        if anew or off:
+            return Cause.PEER_ANEW if anew else Cause.PEER_OFF
         if late:
             return Cause.LATE
         return Cause.MARGIN if self._proven < rules.derate_to else None
@@ -268,14 +275,19 @@ class Supervisor:
         )
 
     def _wait(
-        self, now_ns: int, peer: PeerSample | None, own_m: FloatArray, trouble: Cause | None
+        self,
+        now_ns: int,
+        presence: PeerPresence,
+        peer: PeerSample | None,
+        own_m: FloatArray,
+        trouble: Cause | None,
     ) -> None:
         """READY or ALIGNING: engage as soon as nothing speaks against it."""
         if trouble is not None or peer is None:
             self._go(State.READY, trouble or Cause.NO_PEER)
         elif now_ns < self._rules.not_before_ns:
             self._go(State.READY, Cause.NOT_YET)
-        elif not self._aligned(peer, own_m):
+        elif not self._aligned(presence, peer, own_m):
             self._go(State.ALIGNING, Cause.APART)
         else:
             self._go(State.ENGAGED, Cause.AGREED)
@@ -284,9 +296,10 @@ class Supervisor:
             self._peer_anew = False
             self._resumed_ns = None
 
-    def _aligned(self, peer: PeerSample, own_m: FloatArray) -> bool:
+    def _aligned(self, presence: PeerPresence, peer: PeerSample, own_m: FloatArray) -> bool:
         """Whether the points are near enough; on the way, let a clutched site's offset follow."""
-        if self._rules.leads and self._rules.clutched:
+        # a peer that already follows would be pulled along
+        if self._rules.leads and self._rules.clutched and presence.heard_state != State.ENGAGED:
             self.offset_m = own_m - peer.position_m
         self.apart_m = dist(own_m, peer.position_m + self.offset_m)
         return self.apart_m <= self._rules.align_within_m
@@ -309,21 +322,44 @@ class Supervisor:
             if self._left_ns(now_ns) <= 0:  # until then the force goes, and does not come back
                 self._go(State.READY, Cause.LONG_HOLD)
             return
-        # a peer whose outputs are off is engaging anew: it has to agree on the point again
-        engaging = self._peer_anew or presence.heard_state in _OUTPUTS_OFF
-        if trouble is None and peer is not None and (not engaging or self._aligned(peer, own_m)):
-            self._go(State.ENGAGED, Cause.AGREED)
-            self._resumed_ns = now_ns
-            self._peer_anew = False
+        trouble = trouble or self._apart(presence, peer, own_m)
+        if trouble is not None:
+            self.cause = trouble
+            return
+        self._go(State.ENGAGED, Cause.AGREED)
+        self._resumed_ns = now_ns
+        self._peer_anew = False
+
+    def _apart(
+        self, presence: PeerPresence, peer: PeerSample | None, own_m: FloatArray
+    ) -> Cause | None:
+        """Return what forbids a driven site to couple again with a peer that is well.
+
+        A peer that engages anew goes first: without outputs, its robot may fall.
+        """
+        if peer is None:
+            return Cause.NO_PEER
+        off = presence.heard_state in _OUTPUTS_OFF
+        self._peer_anew = self._peer_anew or off
+        if self._peer_anew and not self._aligned(presence, peer, own_m):
+            return Cause.APART
+        return Cause.PEER_OFF if off else None
 
     def _release(self, now_ns: int, own_m: FloatArray) -> None:
         """Open the clutch: the peer keeps the point it was told last."""
         self._told_m = own_m - self.offset_m
+        self._released_share = self.force_share(now_ns)
         self._released_ns = now_ns
         self._go(State.RELEASED, Cause.CLUTCH)
 
     def _follow_the_hand(
-        self, now_ns: int, own_m: FloatArray, clutch: bool, trouble: Cause | None
+        self,
+        now_ns: int,
+        presence: PeerPresence,
+        peer: PeerSample | None,
+        own_m: FloatArray,
+        clutch: bool,
+        trouble: Cause | None,
     ) -> None:
         """RELEASED: the hand moves the robot, not the point told to the peer."""
         self.offset_m = own_m - self._told_m
@@ -331,8 +367,10 @@ class Supervisor:
             return
         self._coupled_ns = now_ns
         self._resumed_ns = None
+        trouble = trouble or self._apart(presence, peer, own_m)
         if trouble is None:
             self._go(State.ENGAGED, Cause.AGREED)
+            self._peer_anew = False
         else:
             self._hold(now_ns, own_m, trouble)
 

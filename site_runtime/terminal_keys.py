@@ -2,6 +2,7 @@
 
 import os
 import select
+import signal
 import sys
 import termios
 import threading
@@ -22,12 +23,6 @@ class TerminalKeys:
 
     def __init__(self, requests: OperatorRequests) -> None:
         self._requests = requests
-        self._actions = {
-            b" ": requests.toggle_clutch,
-            b"e": requests.stop,
-            b"\x1b": requests.stop,
-            b"r": requests.reset,
-        }
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._read, name="keys", daemon=True)
         self._before: list[object] | None = None
@@ -51,22 +46,43 @@ class TerminalKeys:
         traceback: TracebackType | None,
     ) -> None:
         self._ended.set()
-        if self._before is not None:
-            self._thread.join(timeout=1.0)
+        if self._before is None:
+            return
+        self._thread.join(timeout=1.0)
+        if _in_foreground():
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
 
     def _read(self) -> None:
+        # a read from the background would stop the whole process; so it fails instead
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN})
         terminal = sys.stdin.fileno()
         while not self._ended.is_set():
             if not select.select([terminal], [], [], _LOOK_S)[0]:
                 continue
-            pressed = os.read(terminal, 64)
+            if not _in_foreground():  # the keys are for another
+                self._ended.wait(_LOOK_S)
+                continue
+            try:
+                pressed = os.read(terminal, 64)
+            except OSError:  # the terminal is gone, or another's since that look
+                self._ended.wait(_LOOK_S)
+                continue
             if not pressed:
-                return  # the terminal is gone
-            # an arrow key begins with Esc too; to stop at it is the safe reading
-            action = self._actions.get(pressed[:1])
-            if action is not None:
-                action()
+                return
+            self._act(pressed)
+
+    def _act(self, pressed: bytes) -> None:
+        """Do what these keys ask, together: several come at once if this thread had to wait."""
+        # an arrow key begins with Esc too; to stop at it is the safe reading, and what follows is
+        # part of it
+        if b"e" in pressed or b"\x1b" in pressed:
+            self._requests.stop()
+            return
+        for key in pressed:
+            if key == ord(" "):
+                self._requests.toggle_clutch()
+            elif key == ord("r"):
+                self._requests.reset()
 
 
 def _in_foreground() -> bool:

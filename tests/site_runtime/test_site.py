@@ -10,6 +10,7 @@ import pytest
 
 from channel.channel import Channel, PeerSample
 from channel.memory_link import MemoryLink, memory_links
+from channel.packet import Packet
 from hardware.interface import DeviceError, DeviceState, JointStops
 from hardware.robot_model import PlanarArm, RobotModel, RobotTerms, build_robot
 from site_runtime.clock import ManualClock
@@ -18,7 +19,7 @@ from site_runtime.guard import Cut, Guard, GuardError, Limits
 from site_runtime.keys import SiteId
 from site_runtime.margin import Margin
 from site_runtime.operator_requests import OperatorRequests
-from site_runtime.site import Site, SiteTimes
+from site_runtime.site import LateError, Site, SiteTimes
 from site_runtime.supervisor import EngagementRules, State, Supervisor
 from telemetry.rows import NO_PEER_STATE
 from telemetry.stream import TelemetryStream, decode_batch
@@ -56,6 +57,7 @@ class FakeDevice:
     joint_stops: JointStops = field(default_factory=lambda: JointStops.none(2))
     clutch: bool = False
     wrench: FloatArray = field(default_factory=lambda: np.arange(1.0, 7.0))
+    position: FloatArray = field(default_factory=lambda: Q)
     velocity: FloatArray = field(default_factory=lambda: np.array([0.1, -0.2]))
     written: list[FloatArray] = field(default_factory=list)
 
@@ -68,7 +70,11 @@ class FakeDevice:
     def read(self) -> DeviceState:
         self.journal.note("read")
         return DeviceState(
-            Q.copy(), self.velocity.copy(), self.wrench.copy(), self.clock.now_ns(), self.clutch
+            self.position.copy(),
+            self.velocity.copy(),
+            self.wrench.copy(),
+            self.clock.now_ns(),
+            self.clutch,
         )
 
     def write(self, torque_nm: FloatArray) -> None:
@@ -134,6 +140,10 @@ class NotedChannel(Channel):
 
 class NotedTelemetry(TelemetryStream):
     journal: Journal
+    events: list[tuple[int, str]]
+
+    def event(self, stamp_ns: int, text: str) -> None:
+        self.events.append((stamp_ns, text))
 
     def put(self, **fields: object) -> None:
         self.journal.note("put")
@@ -141,7 +151,11 @@ class NotedTelemetry(TelemetryStream):
 
 
 class Bench:
-    def __init__(self, *, peer_digest: int = DIGEST, send_every: int = 1) -> None:
+    events: list[tuple[int, str]]
+
+    def __init__(
+        self, *, peer_digest: int = DIGEST, send_every: int = 1, certified_s: float = CERTIFIED_S
+    ) -> None:
         self.clock, self.journal, self.requests = ManualClock(), Journal(), OperatorRequests()
         self.published: list[bytes] = []
         mine, theirs = memory_links()
@@ -151,6 +165,7 @@ class Bench:
         channel = self._channel(NotedChannel, mine, 0, DIGEST, EPOCH, send_every)
         telemetry = NotedTelemetry(2, 2, 0, DIGEST, EPOCH, self.published.append, batch_rows=1)
         channel.journal = telemetry.journal = self.journal
+        telemetry.events = self.events = []
         self.device = FakeDevice(self.journal, self.clock)
         self.controller = NotedController(self.journal)
         self.model = build_robot(PlanarArm("planar", (0.4, 0.3), (1.0, 1.0)), None)
@@ -176,7 +191,7 @@ class Bench:
             leads=True,
             clutched=False,
         )
-        relaxed = np.full(2, 0.5 * CERTIFIED_S + 1e-3)
+        relaxed = np.full(2, 0.5 * certified_s + 1e-3)
         self.site = Site(
             SiteId.LOCAL,
             device=self.device,
@@ -184,7 +199,7 @@ class Bench:
             channel=channel,
             controller=self.controller,
             supervisor=Supervisor(rules, 2),
-            margin=Margin(CERTIFIED_S, ((relaxed, relaxed),), MS, derate=True),
+            margin=Margin(certified_s, ((relaxed, relaxed),), MS, derate=True),
             guard=NotedGuard(limits, self.journal),
             telemetry=telemetry,
             clock=self.clock,
@@ -208,7 +223,7 @@ class Bench:
             session_start_ns=0,
         )
 
-    def tick(self, count: int = 1, *, peer_speaks: bool = True) -> list[str]:
+    def tick(self, count: int = 1, *, peer_speaks: bool = True, lateness_ns: int = 7) -> list[str]:
         """Let a millisecond pass, the peer speak, the site tick; return what its tick called."""
         for _ in range(count):
             self.clock.sleep_until_ns(self.clock.now_ns() + MS)
@@ -217,12 +232,22 @@ class Bench:
                 rest = np.zeros(2)
                 self.peer.send(self.clock.now_ns(), self.peer_state, self.peer_position, rest, rest)
             before = len(self.journal.calls)
-            self.site.tick(7)
+            self.site.tick(lateness_ns)
         return self.journal.calls[before:]
 
     def engage(self) -> None:
         self.tick(5)
         assert self.site.state is State.ENGAGED
+
+    def heard(self) -> Packet:
+        """What the peer would hear now."""
+        self.peer.latest(self.clock.now_ns())
+        assert self.peer._newest is not None
+        return self.peer._newest
+
+    def said(self) -> list[str]:
+        """The states and causes told as events, in order."""
+        return [text for _, text in self.events]
 
     def row(self) -> np.void:
         return self.site.telemetry.last(1)[0]
@@ -259,6 +284,7 @@ def test_the_outputs_go_on_once_before_the_first_write(bench: Bench) -> None:
     assert calls.index("enable") < calls.index("controller") < calls.index("write")
     bench.tick(30, peer_speaks=False)
     assert bench.site.state is State.HOLD
+    bench.peer_state = State.ENGAGED
     bench.tick(3)
     assert bench.site.state is State.ENGAGED
     assert bench.journal.count("enable") == 1
@@ -366,6 +392,7 @@ def test_silence_holds_the_last_point_under_torque_and_the_end_of_it_resumes(ben
     assert bench.tick(peer_speaks=False) == DRIVING
     assert bench.site.state is State.HOLD
     assert np.array_equal(bench.controller.asked[-1][0], bench.peer_position)
+    bench.peer_state = State.ENGAGED
     assert bench.tick() == DRIVING
     assert bench.site.state is State.ENGAGED
 
@@ -523,3 +550,307 @@ def test_run_counts_the_ticks_it_missed() -> None:
     assert rows["missed"].tolist() == [0, 0, 0, 9, 9, 9]
     assert rows["lateness_ns"].tolist() == [0, 0, 0, 9 * MS, 0, 0]
     assert rows["duration_ns"].tolist() == [0, 0, 0, 10 * MS, 0, 0]
+
+
+# the operator's stop, the peer's, and the way back
+
+
+@pytest.mark.parametrize("when", ["ready", "engaged", "holding", "released"])
+def test_an_emergency_stop_ends_all_torque_in_that_very_tick(bench: Bench, when: str) -> None:
+    if when == "ready":
+        bench.tick(peer_speaks=False)
+    else:
+        bench.engage()
+        bench.requests.clutch = when == "released"
+        bench.tick(22, peer_speaks=when != "holding")
+    assert bench.site.state is State[{"holding": "HOLD"}.get(when, when.upper())]
+    was_driven = when != "ready"
+    bench.requests.stop()
+    calls = bench.tick()
+    assert calls == ["read", "latest", "terms", *["stop"] * was_driven, "send", "put"]
+    assert bench.site.state is State.EMERGENCY_STOP
+    assert bench.heard().state == State.EMERGENCY_STOP
+    row = bench.row()
+    assert row["state"] == State.EMERGENCY_STOP
+    assert row["torque_nm"].tolist() == row["coupling_force_n"].tolist() == [0.0, 0.0]
+    assert row["force_share"] == 0.0
+    assert bench.tick(50) == ["latest", "send"]
+    assert bench.site.state is State.EMERGENCY_STOP
+    assert bench.row()["state"] == State.EMERGENCY_STOP
+    assert bench.site.failure is None
+    assert bench.said()[-1] == "EMERGENCY_STOP: the operator of this site stopped it"
+
+
+def test_a_peers_emergency_stop_stops_the_device_too(bench: Bench) -> None:
+    bench.engage()
+    bench.peer_state = State.EMERGENCY_STOP
+    calls = bench.tick()
+    assert "stop" in calls
+    assert "write" not in calls
+    assert bench.site.state is State.EMERGENCY_STOP
+    assert bench.said()[-1] == "EMERGENCY_STOP: the peer is in emergency stop"
+
+
+@pytest.mark.parametrize("why", ["stop", "fault"])
+def test_a_reset_opens_the_device_anew_and_the_site_engages_again(bench: Bench, why: str) -> None:
+    bench.engage()
+    if why == "stop":
+        bench.requests.stop()
+    else:
+        bench.journal.trouble["write"] = DeviceError("amplifier too hot")
+    bench.tick(3)
+    bench.journal.trouble.clear()
+    assert bench.site.state in (State.EMERGENCY_STOP, State.FAULT)
+    written = len(bench.device.written)
+    bench.requests.reset()
+    assert bench.tick() == ["latest", "send", "close", "open"]
+    assert bench.site.state is State.READY
+    assert bench.site.failure is None
+    assert bench.said()[-1] == "READY: reset by the operator of this site"
+    bench.peer_state = State.EMERGENCY_STOP
+    bench.tick(10)
+    assert bench.site.state is State.READY
+    assert len(bench.device.written) == written
+    bench.peer_state = State.READY
+    bench.tick(3)
+    assert bench.site.state is State.ENGAGED
+    assert len(bench.device.written) > written
+    assert bench.journal.count("enable") == 2
+
+
+@pytest.mark.parametrize("place", ["open", "close"])
+@pytest.mark.parametrize("why", ["stop", "fault"])
+def test_a_reset_that_fails_is_a_fault_and_may_be_tried_again(
+    bench: Bench, why: str, place: str
+) -> None:
+    bench.engage()
+    if why == "stop":
+        bench.requests.stop()
+    else:
+        bench.journal.trouble["read"] = DeviceError("cable out")
+    bench.tick()
+    bench.journal.trouble = {place: DeviceError("still out")}
+    bench.requests.reset()
+    calls = bench.tick()
+    assert calls[-1] == "stop"
+    assert bench.site.state is State.FAULT
+    assert str(bench.site.failure) == "still out"
+    assert bench.said()[-1] == "FAULT: DeviceError: still out"
+    bench.tick(3)
+    assert bench.heard().state == State.FAULT
+    assert bench.site.state is State.FAULT
+    bench.journal.trouble.clear()
+    bench.requests.reset()
+    bench.tick()
+    assert bench.site.state is State.READY
+    assert bench.site.failure is None
+
+
+def test_a_reset_asked_for_too_early_undoes_no_later_stop(bench: Bench) -> None:
+    bench.engage()
+    bench.requests.reset()
+    bench.tick()
+    bench.peer_state = State.EMERGENCY_STOP
+    bench.tick(5)
+    assert bench.site.state is State.EMERGENCY_STOP
+
+
+def test_a_stop_asked_for_while_stopped_is_over_with_the_reset(bench: Bench) -> None:
+    bench.engage()
+    bench.requests.stop()
+    bench.tick()
+    bench.requests.stop()
+    bench.tick()
+    bench.requests.reset()
+    bench.tick(4)
+    assert bench.site.state is State.ENGAGED
+
+
+def test_a_stop_asked_for_while_the_device_opens_is_heeded(bench: Bench) -> None:
+    bench.engage()
+    bench.requests.stop()
+    bench.tick()
+    slow_open = bench.device.open
+    bench.device.open = lambda: (slow_open(), bench.requests.stop())  # type: ignore[assignment, method-assign, return-value]
+    bench.requests.reset()
+    bench.tick(5)
+    assert bench.site.state is State.EMERGENCY_STOP
+    assert bench.journal.count("enable") == 1
+
+
+# the clutch
+
+
+@pytest.mark.parametrize("how", ["button", "request"])
+def test_the_clutch_releases_the_hand_and_keeps_the_point_told(bench: Bench, how: str) -> None:
+    def hold(opened: bool) -> None:
+        if how == "button":
+            bench.device.clutch = opened
+        else:
+            bench.requests.toggle_clutch()
+
+    bench.peer_state = State.ENGAGED
+    bench.engage()
+    told = bench.heard().position_m
+    hold(True)
+    assert bench.tick() == DRIVING
+    assert bench.site.state is State.RELEASED
+    assert bench.said()[-1] == "RELEASED: the clutch is open"
+    bench.device.position = np.add(Q, [0.2, -0.1])
+    bench.tick(12)
+    moved = (
+        bench.model.terms(bench.device.position, np.zeros(2)).X
+        - bench.model.terms(Q, np.zeros(2)).X
+    )
+    assert bench.heard().position_m == pytest.approx(told)
+    assert bench.heard().state == State.RELEASED
+    row = bench.row()
+    assert row["offset_m"] == pytest.approx(moved)
+    assert row["force_share"] == bench.controller.shares[-1] == 0.0
+    hold(False)
+    bench.tick()
+    assert bench.site.state is State.ENGAGED
+    assert bench.heard().position_m == pytest.approx(told)
+    assert bench.controller.asked[-1][0] == pytest.approx(bench.peer_position + moved)
+    bench.device.position = Q
+    bench.tick()
+    assert bench.heard().position_m == pytest.approx(told - moved)
+
+
+def test_a_stopped_site_goes_on_telling_the_point_it_told_last(bench: Bench) -> None:
+    bench.peer_state = State.ENGAGED
+    bench.engage()
+    told = bench.heard().position_m
+    bench.device.clutch = True
+    bench.tick(2)
+    bench.device.position = np.add(Q, [0.2, -0.1])
+    bench.tick(12)
+    bench.journal.trouble["read"] = DeviceError("cable out")
+    bench.tick(3)
+    assert bench.heard().state == State.FAULT
+    assert bench.heard().position_m == pytest.approx(told)
+    bench.site.close()
+    assert bench.heard().position_m == pytest.approx(told)
+
+
+# late ticks, long holds, old loops
+
+
+def test_late_ticks_in_a_row_lead_to_hold_and_then_to_fault(bench: Bench) -> None:
+    bench.peer_state = State.ENGAGED
+    bench.engage()
+    for _ in range(3):  # one on time in between, and the count begins anew
+        bench.tick(LATE_HOLD - 1, lateness_ns=MS + 1)
+        bench.tick(lateness_ns=MS)
+    assert bench.site.state is State.ENGAGED
+    bench.tick(LATE_HOLD, lateness_ns=MS + 1)
+    assert bench.site.state is State.HOLD
+    assert bench.said()[-1] == "HOLD: the ticks of this site come late, one after the other"
+    bench.tick(LATE_FAULT - LATE_HOLD - 1, lateness_ns=MS + 1)
+    assert bench.site.state is State.HOLD
+    calls = bench.tick(lateness_ns=MS + 1)
+    assert calls == ["read", "latest", "terms", "stop"]
+    assert bench.site.state is State.FAULT
+    assert isinstance(bench.site.failure, LateError)
+    bench.requests.reset()
+    bench.tick()
+    bench.tick(lateness_ns=50 * MS)  # opening the device took its time
+    bench.tick(3)
+    assert bench.site.state is State.ENGAGED
+
+
+def test_one_tick_on_time_ends_the_hold_of_late_ones(bench: Bench) -> None:
+    bench.peer_state = State.ENGAGED
+    bench.engage()
+    bench.tick(LATE_HOLD, lateness_ns=MS + 1)
+    bench.tick()
+    assert bench.site.state is State.ENGAGED
+
+
+def test_a_long_hold_switches_the_outputs_off_and_the_peers_return_on(bench: Bench) -> None:
+    bench.engage()
+    bench.peer_state = State.FAULT
+    bench.tick(STOP_AFTER // MS)
+    assert bench.site.state is State.HOLD
+    assert bench.row()["force_share"] < 0.05  # the last of its release
+    assert bench.tick() == ["read", "latest", "terms", "stop", "send", "put"]
+    assert bench.site.state is State.READY
+    assert bench.said()[-1] == "READY: held for too long"
+    assert bench.tick(20) == WAITING
+    assert bench.journal.count("stop") == 1
+    bench.peer_state = State.READY
+    calls = bench.tick()
+    assert bench.site.state is State.ENGAGED
+    assert calls == ["read", "latest", "terms", "enable", *DRIVING[3:]]
+
+
+def test_the_guard_begins_anew_with_the_outputs(bench: Bench) -> None:
+    bench.engage()
+    restarts: list[int] = []
+    bench.site.guard.restart = lambda: restarts.append(bench.site.ticks)  # type: ignore[method-assign]
+    bench.peer_state = State.FAULT
+    bench.tick(STOP_AFTER // MS + 1)
+    assert bench.site.state is State.READY
+    assert restarts == []
+    bench.peer_state = State.READY
+    bench.tick()
+    assert restarts == [bench.site.ticks - 1]
+
+
+def test_an_older_loop_gets_a_smaller_share_of_force_and_then_none() -> None:
+    bench = Bench(certified_s=0.01)
+    bench.peer_state = State.ENGAGED
+    bench.engage()
+    bench.tick(5)
+    assert bench.row()["force_share"] == 1.0
+    assert bench.row()["loop_bound_s"] <= 0.01
+    bench.tick(15, peer_speaks=False)
+    bench.tick()  # the loop of late, 0.016 s and a few ticks
+    for _ in range(12):
+        bench.tick()
+    row = bench.row()
+    assert row["loop_bound_s"] > 0.01
+    proven = bench.site.margin.share(round((row["loop_bound_s"] - 2e-3) * 1e9))
+    assert 0.25 < proven < 1.0
+    assert bench.site.state is State.ENGAGED
+    assert row["force_share"] == bench.controller.shares[-1] == pytest.approx(proven)
+    bench.tick(HOLD_AFTER // MS, peer_speaks=False)
+    for _ in range(60):
+        bench.tick()
+    assert bench.site.state is State.ENGAGED
+    bench.site.margin.certified_s = 1e-3
+    bench.site.margin._relaxations = ((np.full(2, 2e-3), np.full(2, 2e-3)),)
+    bench.tick()
+    assert bench.site.state is State.HOLD
+    assert bench.said()[-1] == "HOLD: the loop is older than the gains are proven for"
+
+
+def test_every_change_of_state_is_an_event(bench: Bench) -> None:
+    bench.peer_state = State.ENGAGED
+    bench.engage()
+    assert bench.events == [(bench.events[0][0], "ENGAGED: both sites agree")]
+    bench.tick(22, peer_speaks=False)
+    bench.tick(2)
+    bench.device.clutch = True
+    bench.tick(2)
+    bench.device.clutch = False
+    bench.tick(12)
+    bench.requests.stop()
+    bench.tick(2)
+    bench.requests.reset()
+    bench.tick(4)
+    bench.journal.trouble["write"] = DeviceError("too hot")
+    bench.tick(3)
+    stamps = [stamp for stamp, _ in bench.events]
+    assert stamps == sorted(stamps)
+    assert bench.said() == [
+        "ENGAGED: both sites agree",
+        "HOLD: the peer is silent",
+        "ENGAGED: both sites agree",
+        "RELEASED: the clutch is open",
+        "ENGAGED: both sites agree",
+        "EMERGENCY_STOP: the operator of this site stopped it",
+        "READY: reset by the operator of this site",
+        "ENGAGED: both sites agree",
+        "FAULT: DeviceError: too hot",
+    ]
