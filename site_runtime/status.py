@@ -12,7 +12,7 @@ from rich.text import Text
 from channel.packet import Reject
 from site_runtime.guard import cut_names
 from site_runtime.site import Site
-from site_runtime.supervisor import Cause, State
+from site_runtime.supervisor import DRIVEN, Cause, State
 from telemetry.recorder_process import RecorderProcess
 
 LIVE_INTERVAL_S = 0.5
@@ -72,6 +72,8 @@ def describe(site: Site, rate_hz: float, recorder: RecorderProcess | None = None
         parts.append(site.cause.value)
     if site.cause is Cause.APART:
         parts.append(f"{site.apart_m * 1e3:.0f} mm")
+    if site.state in DRIVEN and site.scale < 1.0:
+        parts.append(f"DE-RATED to {site.scale:.0%}")
     if not isnan(round_trip_ms):
         parts.append(f"round trip {round_trip_ms:6.1f} ms")
     if not isnan(margin_ms):

@@ -130,3 +130,12 @@ def test_the_line_and_the_summary_say_what_the_recorder_could_not_do(fresh: Site
     assert "2 kept in /state/[demo]/local" in text
     recorder.trouble = None
     assert "record" not in describe(fresh, 100.0, recorder)
+
+
+def test_the_line_warns_of_gains_that_are_de_rated(fresh: Site) -> None:
+    fresh._supervisor.state = State.ENGAGED
+    assert "DE-RATED" not in describe(fresh, 100.0)
+    fresh._supervisor._scale = 0.6
+    assert "DE-RATED to 60%" in describe(fresh, 100.0)
+    fresh._supervisor.state = State.READY
+    assert "DE-RATED" not in describe(fresh, 100.0)
