@@ -206,7 +206,7 @@ class Site:
             elif before in DRIVEN and state not in DRIVEN:
                 self._device.stop()
             self.telemetry.event(now_ns, f"{state.name}: {supervisor.cause.value}")
-        if (supervisor.scale < 1.0) is not self._derated:
+        if state is State.ENGAGED and (supervisor.scale < 1.0) is not self._derated:
             self._derated = not self._derated
             margin = self.margin
             self.telemetry.event(

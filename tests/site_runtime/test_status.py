@@ -14,6 +14,7 @@ from site_runtime.guard import Cut
 from site_runtime.session import LoopSettings, load_session
 from site_runtime.site import Site
 from site_runtime.status import StatusLine, describe, summary
+from site_runtime.supervisor import State
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
