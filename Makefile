@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: demo test lint format screenshot reproduce lock clean
+.PHONY: demo test lint format screenshot reproduce fuzz faults soak lock clean
 
 demo: $(READY)  ## both sites on this machine, with the dashboard, until Ctrl-C
 	$(BIN)/farhand demo $(ARGS)
@@ -26,6 +26,17 @@ screenshot: $(READY)  ## the dashboard's picture in the README
 
 reproduce: $(READY)  ## the paper's figures and claims, into docs/reproduction
 	$(BIN)/farhand reproduce all --out docs/reproduction
+
+fuzz: $(READY)  ## a million mutated packets, then a coverage-guided minute
+	$(BIN)/python -m tests.fuzz.packets --count 1000000
+	$(BIN)/python -m tests.fuzz.atheris_packet -- -max_total_time=60
+
+faults: $(READY)  ## the tables of docs/safety.md: every fault 20 times on real processes
+	$(BIN)/python -m tests.faults.measure $(ARGS)
+	$(BIN)/python -m tests.faults.test_watchdogs --repeats 20
+
+soak: $(READY)  ## both daemons under a random schedule of faults; ARGS="--minutes 60 --seed 2"
+	$(BIN)/python -m tests.faults.soak $(ARGS)
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "farhand needs Python 3.11 or later, this is " + sys.version.split()[0])'

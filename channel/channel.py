@@ -107,6 +107,7 @@ class Channel:
         self._newest: Packet | None = None
         self._heard_ns = 0
         self._mismatch_ns: int | None = None
+        self._replaced: set[int] = set()
         self._used_stamp_ns = NO_STAMP
         self._greatest_age = GreatestAge()
         self._sequence = 0
@@ -219,7 +220,7 @@ class Channel:
         if mine_ns == NO_AGE or self._newest is None or not self.peer_confirmed:
             return None
         theirs_ns = self._newest.greatest_age_ns
-        return None if theirs_ns == NO_AGE else mine_ns + theirs_ns
+        return None if theirs_ns == NO_AGE else max(0, mine_ns + theirs_ns)
 
     @property
     def peer_present(self) -> bool:
@@ -275,6 +276,8 @@ class Channel:
         if packet.position_m.size != self._dimension:
             return Reject.DIMENSION
         newest = self._newest
+        if packet.epoch in self._replaced:
+            return Reject.EPOCH
         if newest is not None and packet.epoch != newest.epoch:
             silent = now_ns - self._heard_ns >= self._silence_ns
             # a recording may have been heard first: it gives way to a peer that answers me
@@ -286,6 +289,9 @@ class Channel:
     def _accept(self, packet: Packet, now_ns: int) -> None:
         newest = self._newest
         if newest is not None and packet.epoch != newest.epoch:
+            if packet.echo_epoch == self._epoch:
+                # a live run has taken its place: what is heard of it from now on is a recording
+                self._replaced.add(newest.epoch)
             self._forget_peer()
             newest = None
         if newest is not None:

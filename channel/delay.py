@@ -14,6 +14,8 @@ from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
+_MOST_S = 3600.0  # in nanoseconds, as the injection counts, a delay without limit overflows
+
 
 def _require(condition: bool, key: str, value: object, allowed: str) -> None:
     if not condition:
@@ -21,7 +23,7 @@ def _require(condition: bool, key: str, value: object, allowed: str) -> None:
 
 
 def _require_delay(key: str, value: float) -> None:
-    _require(math.isfinite(value) and value >= 0.0, key, value, "finite and at least 0 s")
+    _require(0.0 <= value <= _MOST_S, key, value, f"between 0 and {_MOST_S:g} s")
 
 
 def _require_finite(key: str, value: float) -> None:
@@ -228,6 +230,8 @@ class _Trace:
 @lru_cache(maxsize=8)
 def _read_trace(path: str) -> _Trace:
     try:
+        if not Path(path).is_file():  # a device or a pipe may have no end
+            raise OSError("there is no such file")
         with Path(path).open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -3,6 +3,7 @@
 from channel.packet import NO_AGE
 
 WINDOW_NS = 1_000_000_000
+_MOST_NS = 2**63 - 1
 
 
 class GreatestAge:
@@ -21,7 +22,7 @@ class GreatestAge:
         self._before_ns = NO_AGE
 
     def add(self, now_ns: int, age_ns: int) -> None:
-        """Take the age of the sample in use at `now_ns`."""
+        """Take the age of the sample in use at `now_ns`, at most what a packet holds."""
         if self._since_ns is None:
             self._since_ns = now_ns
         elif now_ns - self._since_ns >= WINDOW_NS // 2:
@@ -30,7 +31,7 @@ class GreatestAge:
             self._current_ns = NO_AGE
             self._since_ns = now_ns if stale else self._since_ns + WINDOW_NS // 2
         if age_ns > self._current_ns:
-            self._current_ns = age_ns
+            self._current_ns = min(age_ns, _MOST_NS)
 
     @property
     def value_ns(self) -> int:

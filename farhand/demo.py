@@ -136,12 +136,12 @@ def _status(newest: dict[int, Batch]) -> Table:
             continue
         rows = batch.rows
         error_mm = 1e3 * float(np.linalg.norm(rows["position_m"][-1] - rows["peer_position_m"][-1]))
-        trip_ms = 1e3 * float(rows["round_trip_s"][-1])
+        loop_ms = 1e3 * float(rows["loop_bound_s"][-1])
         certified_ms = 1e3 * float(rows["certified_round_trip_s"][-1])
         table.add_row(
             site.label,
             State(rows["state"][-1]).name,
-            "no peer yet" if isnan(trip_ms) else f"trip {trip_ms:.0f} of {certified_ms:.0f} ms",
+            "no peer yet" if isnan(loop_ms) else f"loop {loop_ms:.0f} of {certified_ms:.0f} ms",
             "" if isnan(error_mm) else f"error {error_mm:.1f} mm",
             f"late {rows['lateness_ns'].max() * 1e-3:.0f} µs",
             f"missed {rows['missed'][-1]}",

@@ -261,7 +261,7 @@ def _build_urdf(arm: UrdfArm, base_dir: Path | None) -> RobotModel:
         raise DeviceConfigurationError(f"there is no URDF file {path}; correct `path`")
     try:
         parsed = pin.buildModelFromUrdf(str(path), mimic=True)
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:  # RuntimeError: a file that cannot be read
         raise DeviceConfigurationError(f"{path} cannot be read as URDF: {error}") from error
     frame = _frame_id(parsed, arm.end_effector_frame, path)
     chain = list(parsed.supports[parsed.frames[frame].parentJoint])[1:]

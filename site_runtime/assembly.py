@@ -21,6 +21,7 @@ from site_runtime.parts import limits_of, robot_of
 from site_runtime.session import LocalSettings, RemoteSettings, Session
 from site_runtime.site import Site, SiteTimes
 from site_runtime.supervisor import EngagementRules, Supervisor
+from telemetry.row_ring import Memory
 from telemetry.stream import TelemetryStream
 
 
@@ -30,7 +31,8 @@ class Surroundings:
 
     Session time is zero at `session_start_ns` on its clock; `epoch` names this run and differs
     from every other; `publish` takes telemetry and must not block; `shared_clock` says that both
-    sites read one clock; `requests` are those of this site's operator.
+    sites read one clock; `requests` are those of this site's operator; `allocate` gives the memory
+    that telemetry rows are kept in.
     """
 
     link: Link
@@ -40,6 +42,7 @@ class Surroundings:
     publish: Callable[[bytes], None]
     shared_clock: bool = False
     requests: OperatorRequests = field(default_factory=OperatorRequests)
+    allocate: Callable[[int], Memory] = bytearray
 
 
 def device_of(settings: LocalSettings | RemoteSettings, context: DeviceContext) -> Device:
@@ -103,7 +106,13 @@ def assemble(
         margin=margin_of(session),
         guard=Guard(limits_of(own.limits, robot, device.joint_stops), session.period_ns * 1e-9),
         telemetry=TelemetryStream(
-            n, z, identity, session.digest, surroundings.epoch, surroundings.publish
+            n,
+            z,
+            identity,
+            session.digest,
+            surroundings.epoch,
+            surroundings.publish,
+            allocate=surroundings.allocate,
         ),
         clock=clock,
         times=SiteTimes(

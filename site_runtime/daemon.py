@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -17,6 +17,7 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
 from site_runtime.clock import SteadyClock
+from site_runtime.flight_recorder import start_recorder
 from site_runtime.keys import SiteId, state_key, telemetry_key
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, RealTimeReport, apply_real_time
@@ -24,6 +25,8 @@ from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
 from site_runtime.status import StatusLine, summary
 from site_runtime.terminal_keys import HELP, TerminalKeys
+from telemetry.recorder_process import RecorderProcess, SharedMemory
+from telemetry.rows import TelemetryError
 
 SessionPath: TypeAlias = Annotated[
     Path, typer.Argument(metavar="SESSION.toml", help="The session file; the same at both sites.")
@@ -45,6 +48,9 @@ Duration: TypeAlias = Annotated[
 Quiet: TypeAlias = Annotated[
     bool, typer.Option("--quiet", help="No live status line; the summary still comes.")
 ]
+NoRecord: TypeAlias = Annotated[
+    bool, typer.Option("--no-record", help="No flight recorder: nothing is written to the disk.")
+]
 
 # Ctrl-C, a service manager, a terminal or a login that is lost
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -63,6 +69,7 @@ class DaemonOptions:
     listen: tuple[str, ...] | None
     duration_s: float | None
     quiet: bool
+    record: bool
 
 
 def site_command(
@@ -76,12 +83,14 @@ def site_command(
         listen: Listen = None,
         duration: Duration = None,
         quiet: Quiet = False,
+        no_record: NoRecord = False,
     ) -> None:
         options = DaemonOptions(
             None if connect is None else tuple(connect),
             None if listen is None else tuple(listen),
             duration,
             quiet,
+            not no_record,
         )
         raise typer.Exit(run_daemon(identity, build, session, options))
 
@@ -105,7 +114,10 @@ def run_daemon(
         session = load_session(session_path)
         clock = SteadyClock()
         requests = OperatorRequests()
-        with closing(_node(session, identity, options)) as node:
+        with (
+            closing(_node(session, identity, options)) as node,
+            closing(SharedMemory()) as memory,
+        ):
             surroundings = Surroundings(
                 link=node.link(
                     state_key(session.name, identity), state_key(session.name, identity.peer)
@@ -115,6 +127,7 @@ def run_daemon(
                 epoch=time.time_ns(),
                 publish=node.publisher(telemetry_key(session.name, identity)),
                 requests=requests,
+                allocate=memory.allocate if options.record else bytearray,
             )
             site = build(session, surroundings)
             _greet(console, session, site)
@@ -123,15 +136,19 @@ def run_daemon(
             with (
                 StopSignals(clock, options.duration_s, requests) as signals,
                 TerminalKeys(requests) as keys,
-                StatusLine(site, quiet=options.quiet),
+                start_recorder(session, site, memory)
+                if options.record
+                else nullcontext() as recorder,
+                StatusLine(site, recorder, quiet=options.quiet),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
-                _report(console, real_time)
+                _report(console, real_time, recorder)
                 if keys.listening and not options.quiet:
                     console.print(HELP, highlight=False)
                 site.run(signals.asked_to_stop)
-            summary(site, Console())
-    except (SessionError, LinkError, HardwareError, RealTimeError) as error:
+                site.telemetry.farewell(clock.now_ns())
+            summary(site, Console(), recorder)
+    except (SessionError, LinkError, HardwareError, RealTimeError, TelemetryError) as error:
         console.print(f"{identity.label} site: {error}", style="red", highlight=False, markup=False)
         return EXIT_NOT_STARTED
     return EXIT_FAULT if site.failure is not None else 0
@@ -209,6 +226,10 @@ def _greet(console: Console, session: Session, site: Site) -> None:
     )
 
 
-def _report(console: Console, real_time: RealTimeReport) -> None:
+def _report(console: Console, real_time: RealTimeReport, recorder: RecorderProcess | None) -> None:
+    if recorder is not None:
+        console.print(
+            f"recording in {recorder.folder}", highlight=False, markup=False, soft_wrap=True
+        )
     for refusal in real_time.refused:
         console.print(f"[yellow]real time:[/yellow] {refusal}", highlight=False)

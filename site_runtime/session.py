@@ -1,7 +1,7 @@
 """The session file: TOML that both sites read, as typed, frozen, validated values.
 
 Both sites must hold the same session. `Session.digest` says so: neither comments nor addresses
-nor a machine's real-time settings change it, every other key does.
+nor a machine's real-time settings and recordings change it, every other key does.
 """
 
 import hashlib
@@ -51,6 +51,7 @@ from site_runtime.session_settings import (
     PaperObstacleTask,
     Pulse,
     PulsesOperator,
+    RecorderSettings,
     RemoteSettings,
     SessionFile,
     StiffnessCoupling,
@@ -86,6 +87,7 @@ __all__ = [
     "Pulse",
     "PulsesOperator",
     "RealTimeSettings",
+    "RecorderSettings",
     "RemoteSettings",
     "Session",
     "SessionError",
@@ -112,11 +114,14 @@ class Session(SessionFile):
         return self.local if identity is SiteId.LOCAL else self.remote
 
 
+_MOST_TEXT = 100_000
+_MOST_LINE = 2_000
 _ADAPTER = TypeAdapter(SessionFile)
 PATH_KEYS = (
     *(f"{site}.robot.path" for site in ("local", "remote")),
     *(f"channel.{direction}.delay.path" for direction in DIRECTIONS),
     "network.zenoh_config",
+    "recorder.directory",
 )
 """The keys that name files, relative to the session file."""
 
@@ -133,6 +138,7 @@ def load_session(path: Path | str) -> Session:
 
 def parse_session(text: str, path: Path) -> Session:
     """Validate a session file's text; paths in it are relative to the folder of `path`."""
+    _require_size(text, path)
     try:
         document = tomllib.loads(text)
         _resolve_paths(document, path.resolve().parent)
@@ -156,6 +162,15 @@ def parse_session(text: str, path: Path) -> Session:
     return Session(**keys, path=path, text=text, digest=digest)
 
 
+def _require_size(text: str, path: Path) -> None:
+    """Refuse what no session needs: a dotted key of n parts costs tomllib n² bytes and more."""
+    longest = max(map(len, text.splitlines()), default=0)
+    for length, most, what in ((len(text), _MOST_TEXT, "it"), (longest, _MOST_LINE, "a line")):
+        if length > most:
+            reason = f"{what} has {length} characters; a session file has at most {most}"
+            raise SessionFileError(path, [Problem("the file", ABSENT, reason)])
+
+
 def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
     """Make the paths absolute, so that nothing depends on where a daemon is started."""
     for dotted in PATH_KEYS:
@@ -170,7 +185,7 @@ def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
 def _digest(file: SessionFile) -> int:
     """64 bits over everything that both sites must agree on."""
     agreed = _plain(file)
-    for own in ("network", "real_time"):
+    for own in ("network", "real_time", "recorder"):
         del agreed[own]
     canonical = json.dumps(agreed, sort_keys=True, separators=(",", ":"))
     return int.from_bytes(hashlib.blake2b(canonical.encode(), digest_size=8).digest(), "little")

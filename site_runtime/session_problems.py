@@ -10,6 +10,8 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
+from functools import cache
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from pydantic import ValidationError
@@ -47,6 +49,7 @@ _FOREIGN_UNITS = (
     *("ns_per_m", "nms", "nms_per_rad", "nm_s_per_rad", "m_per_s2", "g0"),
 )
 _SUFFIXES = sorted({*_UNITS, *_FOREIGN_UNITS}, key=len, reverse=True)
+_MOST_TOLD = 200
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -86,12 +89,13 @@ class SessionFileError(SessionError):
         return type(self), (self.path, self.problems)
 
 
-def keys_of(table: type) -> dict[str, Any]:
+@cache
+def keys_of(table: type) -> Mapping[str, Any]:
     """Return the keys of a table and their annotations."""
     if not is_dataclass(table):
         return {}
     hints = get_type_hints(table, include_extras=True)
-    return {item.name: hints[item.name] for item in fields(table)}
+    return MappingProxyType({item.name: hints[item.name] for item in fields(table)})
 
 
 def tables_of(annotation: object) -> tuple[type, ...]:
@@ -137,9 +141,10 @@ def describe(annotation: object) -> str:
 
 def explain(error: ValidationError, annotation: object, document: object) -> Iterator[Problem]:
     """Turn pydantic's findings about `document`, validated as `annotation`, into problems."""
+    details = error.errors(include_url=False)
     found = [
         problem
-        for detail in error.errors(include_url=False)
+        for detail in details[:_MOST_TOLD]
         for problem in _explain_one(detail, annotation, document)
     ]
     # A mistyped key is one problem, not also the absence of the key that was meant.
@@ -150,6 +155,9 @@ def explain(error: ValidationError, annotation: object, document: object) -> Ite
         if not absent and (problem.key, problem.reason) not in told:
             told.add((problem.key, problem.reason))
             yield problem
+    if len(details) > _MOST_TOLD:
+        reason = f"has {len(details) - _MOST_TOLD} more problems; these are the first"
+        yield Problem("the file", ABSENT, reason)
 
 
 def _explain_one(detail: Mapping[str, Any], annotation: object, value: object) -> Iterator[Problem]:
@@ -188,7 +196,7 @@ def _explain_one(detail: Mapping[str, Any], annotation: object, value: object) -
         for inner in cause.problems:
             yield Problem(f"{key}{inner.key}", inner.value, inner.reason)
     elif cause is not None:
-        yield Problem(key, ABSENT if isinstance(value, dict) else value, str(cause))
+        yield Problem(key or "the file", ABSENT if isinstance(value, dict) else value, str(cause))
     elif annotation is None or not key:
         yield Problem(key or "the file", value if key else ABSENT, detail["msg"])
     else:
@@ -219,14 +227,15 @@ def dotted(table: str, key: str) -> str:
 class Lines:
     """Where keys stand in a TOML text. Knows headers and `key =` lines, which is nearly all."""
 
-    _HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\]#]+?)\s*\]\]?\s*(?:#.*)?$")
-    _KEY = re.compile(r"\s*([A-Za-z0-9_.\- \"']+?)\s*=")
+    # Each run of blanks can be matched in one way only: a long one must not take long.
+    _HEADER = re.compile(r"(\[\[?)\s*([^\[\]#]*[^\[\]#\s])\s*\]\]?\s*(?:#.*)?$")
+    _KEY = re.compile(r"([A-Za-z0-9_.\- \"']*[A-Za-z0-9_.\-\"'])\s*=")
 
     def __init__(self, text: str) -> None:
         self._lines: dict[str, int] = {}
         counts: dict[str, int] = {}
         table = ""
-        for number, line in enumerate(text.splitlines(), start=1):
+        for number, line in enumerate(map(str.strip, text.splitlines()), start=1):
             header, key = self._HEADER.match(line), self._KEY.match(line)
             if header:
                 table = header[2]

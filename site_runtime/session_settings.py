@@ -104,7 +104,7 @@ class ChannelSettings:
     """Delay injection, and how often a site sends (None: every tick)."""
 
     injection: Literal["exact", "added", "off"] = "off"
-    send_rate_hz: Annotated[int, Field(ge=1)] | None = None
+    send_rate_hz: Annotated[int, Field(ge=1, le=MOST_HZ)] | None = None
     local_to_remote: Direction = field(default_factory=_no_delay)
     remote_to_local: Direction = field(default_factory=_no_delay)
 
@@ -118,6 +118,14 @@ class NetworkSettings:
     local_connect: Locator = "tcp/127.0.0.1:7447"
     lease_s: Annotated[float, Field(ge=0.05, le=60)] = 0.5
     zenoh_config: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSettings:
+    """Where the flight recorder of this machine writes (None: the user's state), and how much."""
+
+    directory: str | None = None
+    keep_s: Positive = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,6 +394,7 @@ class SessionFile:
     engagement: EngagementSettings = EngagementSettings()
     channel: ChannelSettings = ChannelSettings()
     network: NetworkSettings = NetworkSettings()
+    recorder: RecorderSettings = RecorderSettings()
     local: LocalSettings
     remote: RemoteSettings
 

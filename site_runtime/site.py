@@ -91,6 +91,7 @@ class Site:
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
         self._late_ticks = 0
+        self._derated = False
         self._told_m = np.zeros(robot.task_dimension)
 
     @property
@@ -102,6 +103,11 @@ class Site:
     def cause(self) -> Cause:
         """Why it is in that state."""
         return self._supervisor.cause
+
+    @property
+    def scale(self) -> float:
+        """Share of the gains left by de-rating, 1 if none is taken."""
+        return self._supervisor.scale
 
     @property
     def apart_m(self) -> float:
@@ -200,6 +206,14 @@ class Site:
             elif before in DRIVEN and state not in DRIVEN:
                 self._device.stop()
             self.telemetry.event(now_ns, f"{state.name}: {supervisor.cause.value}")
+        if state is State.ENGAGED and (supervisor.scale < 1.0) is not self._derated:
+            self._derated = not self._derated
+            margin = self.margin
+            self.telemetry.event(
+                now_ns,
+                f"{'de-rated' if self._derated else 'full gains'}: the loop is up to "
+                f"{margin.loop_s:.3f} s old, certified {margin.certified_s:.3f} s",
+            )
         return state
 
     def _tick_stopped(self, now_ns: int, lateness_ns: int) -> None:

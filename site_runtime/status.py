@@ -12,7 +12,8 @@ from rich.text import Text
 from channel.packet import Reject
 from site_runtime.guard import cut_names
 from site_runtime.site import Site
-from site_runtime.supervisor import Cause, State
+from site_runtime.supervisor import DRIVEN, Cause, State
+from telemetry.recorder_process import RecorderProcess
 
 LIVE_INTERVAL_S = 0.5
 LOG_INTERVAL_S = 10.0
@@ -24,8 +25,11 @@ class StatusLine:
     Rewritten in place on a terminal twice a second; in a log, one line every ten seconds.
     """
 
-    def __init__(self, site: Site, *, quiet: bool = False) -> None:
+    def __init__(
+        self, site: Site, recorder: RecorderProcess | None = None, *, quiet: bool = False
+    ) -> None:
         self._site = site
+        self._recorder = recorder
         self._in_place = sys.stderr.isatty()
         self._interval_s = LIVE_INTERVAL_S if self._in_place else LOG_INTERVAL_S
         self._quiet = quiet
@@ -53,14 +57,14 @@ class StatusLine:
         before = self._site.ticks
         while not self._ended.wait(self._interval_s):
             ticks = self._site.ticks
-            line = describe(self._site, (ticks - before) / self._interval_s)
+            line = describe(self._site, (ticks - before) / self._interval_s, self._recorder)
             before = ticks
             sys.stderr.write(f"\r\x1b[K{line}" if self._in_place else f"{line}\n")
             sys.stderr.flush()
 
 
-def describe(site: Site, rate_hz: float) -> str:
-    """One line: state, rate, round trip, margin to the certified one, position error."""
+def describe(site: Site, rate_hz: float, recorder: RecorderProcess | None = None) -> str:
+    """One line: state, rate, round trip, margin to the certified one, position error, troubles."""
     round_trip_ms = site.round_trip_s * 1e3
     margin_ms = (site.margin.certified_s - site.margin.loop_s) * 1e3
     parts = [f"{site.identity.label:6} {site.state.name:8} {rate_hz:6.0f} Hz"]
@@ -68,6 +72,8 @@ def describe(site: Site, rate_hz: float) -> str:
         parts.append(site.cause.value)
     if site.cause is Cause.APART:
         parts.append(f"{site.apart_m * 1e3:.0f} mm")
+    if site.state in DRIVEN and site.scale < 1.0:
+        parts.append(f"DE-RATED to {site.scale:.0%}")
     if not isnan(round_trip_ms):
         parts.append(f"round trip {round_trip_ms:6.1f} ms")
     if not isnan(margin_ms):
@@ -80,11 +86,13 @@ def describe(site: Site, rate_hz: float) -> str:
         parts.append("the peer has ANOTHER session file")
     if site.failure is not None:
         parts.append(f"{type(site.failure).__name__}: {site.failure}")
+    if recorder is not None and recorder.trouble is not None:
+        parts.append(recorder.trouble)
     return " · ".join(parts)
 
 
-def summary(site: Site, console: Console) -> None:
-    """Print what the run was: ticks, lateness, packets, cuts, the fault if there was one."""
+def summary(site: Site, console: Console, recorder: RecorderProcess | None = None) -> None:
+    """Print what the run was: ticks, lateness, packets, cuts, recording, the fault if any."""
     p50, p99, p999, worst = site.lateness.percentiles_us(50, 99, 99.9, 100)
     counters = site.channel.counters
     table = Table(title=f"{site.identity.label} site", show_header=False, title_justify="left")
@@ -110,6 +118,10 @@ def summary(site: Site, console: Console) -> None:
         table.add_row(
             "guard cut", ", ".join(f"{cut_names(cut)} in {n} ticks" for cut, n in cuts.items())
         )
+    if recorder is not None and recorder.incidents:
+        table.add_row("incidents", Text(f"{recorder.incidents} kept in {recorder.folder}"))
+    if recorder is not None and recorder.trouble is not None:
+        table.add_row("recorder", Text(recorder.trouble, style="red"))
     if site.state is State.FAULT and site.failure is not None:
         failure = f"{type(site.failure).__name__}: {site.failure}"
         table.add_row("FAULT", Text(failure, style="red"))  # no markup: vectors have brackets

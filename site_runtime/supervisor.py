@@ -194,6 +194,11 @@ class Supervisor:
             self.target_m = self._blended(now_ns, peer.position_m + self.offset_m)
         return self.state
 
+    @property
+    def scale(self) -> float:
+        """Share of the gains left by de-rating, 1 if none is taken."""
+        return self._scale
+
     def told_m(self, own_m: FloatArray) -> FloatArray:
         """Return the point (z,) to tell the peer, for this site's X."""
         return self._told_m if self.state is State.RELEASED else own_m - self.offset_m

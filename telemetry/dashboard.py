@@ -266,7 +266,7 @@ class Painter:
         send("force", external_n, np.linalg.norm(rows["coupling_force_n"], axis=1))
         send("torque", rows["torque_nm"])
         send("delay", rows["one_way_delay_s"] * 1e3)
-        send("round_trip", rows["round_trip_s"] * 1e3)
+        send("round_trip", rows["loop_bound_s"] * 1e3)
         send("lateness", rows["lateness_ns"] * 1e-3)
         send("angle", rows["q"])
         send("speed", rows["q_dot"])
@@ -277,7 +277,8 @@ class Painter:
                 "round_trip/certified", times_ns, rows["certified_round_trip_s"] * 1e3
             )
             if len(self._remote.track.rows):
-                apart_m = rows["position_m"] - self._remote.track.position_at(times_ns)
+                told_m = rows["position_m"] - rows["offset_m"]
+                apart_m = told_m - self._remote.track.position_at(times_ns)
                 self._send_finite("error/apart", times_ns, np.linalg.norm(apart_m, axis=1) * 1e3)
         self._log_states(site, times_ns, rows)
         for time_ns, level, text in site.events.observe(times_ns, rows):
@@ -535,7 +536,7 @@ def _blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
             ),
             rrb.Vertical(
                 plot("delay", "One-way delay [ms]"),
-                plot("round_trip", "Round trip [ms]"),
+                plot("round_trip", "Greatest loop age [ms]"),
                 plot("lateness", "Loop lateness [µs]"),
             ),
             column_shares=[5, 3, 3],

@@ -8,13 +8,17 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from telemetry.row_ring import Memory, RingLayout, RowRing
 from telemetry.rows import LAYOUT_VERSION, RowArray, TelemetryError, row_dtype
 
 FloatArray = npt.NDArray[np.float64]
 
 MAGIC: Final = b"FHTB"
 MAX_BATCH_ROWS: Final = 10_000
-RING_BATCHES: Final = 80
+RING_BATCHES: Final = 240  # at 1 kHz, 12 s for a recorder that is held up
+_MOST: Final = 2**32 - 1  # that a counter's column holds
+FAREWELL: Final = "farewell"
+"""The last event of a site that ended in good order."""
 
 # magic, layout version, site, joints, dimension, rows, session digest, epoch, first sequence
 _HEADER: Final = struct.Struct("<4sBBBBIQQQ")
@@ -38,8 +42,9 @@ class Batch:
 class TelemetryStream:
     """The producer's side: `put` in the tick, `flush` in the slack after it, one thread.
 
-    A ring of 80 batches of rows is allocated once; `publish` gets each full batch as bytes and must
-    not block. Rows overwritten before they were flushed are lost and counted.
+    A ring of 240 batches of rows is allocated once, by `allocate` if a recorder is to read it;
+    `publish` gets each full batch as bytes and must not block. Rows overwritten before they were
+    flushed are lost and counted.
     """
 
     def __init__(
@@ -51,6 +56,7 @@ class TelemetryStream:
         epoch: int,
         publish: Callable[[bytes], None],
         batch_rows: int = 50,
+        allocate: Callable[[int], Memory] = bytearray,
     ) -> None:
         if not 1 <= batch_rows <= MAX_BATCH_ROWS:
             raise TelemetryError(f"batches of {batch_rows} rows; use 1 to {MAX_BATCH_ROWS}")
@@ -68,7 +74,10 @@ class TelemetryStream:
         self._count = 0
         self._flushed = 0
         self._dropped = 0
-        ring = np.zeros(self._capacity, row_dtype(joints, dimension))
+        layout = RingLayout(site, joints, dimension, self._capacity, session_digest, epoch)
+        self.ring = RowRing.create(layout, allocate)
+        self._count_row = self.ring.count_row
+        ring = self.ring.rows
         self._ring = ring
         # A view a field: assigning by view costs a quarter of assigning by field name.
         self._sequence = ring["sequence"]
@@ -147,8 +156,9 @@ class TelemetryStream:
     ) -> None:
         """Write one row into the ring; real-time safe. Fields as in `COLUMNS`.
 
-        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A row whose
-        assignment raises (a wrong shape) is not counted.
+        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A counter
+        stays at the most that it holds. A row whose assignment raises (a wrong shape) is not
+        counted.
         """
         i = self._count % self._capacity
         self._sequence[i] = self._count
@@ -177,11 +187,12 @@ class TelemetryStream:
         self._link_distance_m[i] = link_distance_m
         self._midpoint_distance_m[i] = midpoint_distance_m
         self._sub_task_error_rad_s[i] = sub_task_error_rad_s
-        self._lost[i] = lost
-        self._late[i] = late
-        self._rejected[i] = rejected
-        self._missed[i] = missed
+        self._lost[i] = min(lost, _MOST)
+        self._late[i] = min(late, _MOST)
+        self._rejected[i] = min(rejected, _MOST)
+        self._missed[i] = min(missed, _MOST)
         self._count += 1
+        self._count_row(self._count)
 
     def repeat_stopped(self, *, stamp_ns: int, time_ns: int, lateness_ns: int, state: int) -> None:
         """Write the newest row again for a site that no longer reads its device; real-time safe.
@@ -203,9 +214,15 @@ class TelemetryStream:
         self._coupling_force_n[i] = 0.0
         self._force_share[i] = 0.0
         self._count += 1
+        self._count_row(self._count)
 
     def event(self, stamp_ns: int, text: str) -> None:
-        """Note what happened; real-time safe."""
+        """Tell the recorder what happened, in at most 240 bytes of UTF-8; real-time safe."""
+        self.ring.put_event(stamp_ns, text)
+
+    def farewell(self, stamp_ns: int) -> None:
+        """Tell the recorder that the site ends in good order."""
+        self.event(stamp_ns, FAREWELL)
 
     def flush(self) -> None:
         """Publish every full batch not yet published; nothing to do in most ticks."""

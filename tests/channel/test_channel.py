@@ -516,3 +516,24 @@ def test_offset_is_unknown_until_there_is_an_exchange() -> None:
     wire.hear(0, wire.packet(1, echo_epoch=0))
     assert wire.channel.offset is None
     assert wire.channel.one_way_ns is None
+
+
+def test_a_run_that_gave_way_to_a_live_one_is_never_heard_again() -> None:
+    wire = Wire()
+    wire.hear(1 * MS, wire.packet(1))
+    wire.hear(100 * MS, wire.packet(1, epoch=1002, stamp_ns=100 * MS))
+    assert wire.channel.counters.peer_restarts == 1
+    wire.hear(300 * MS, wire.packet(2, stamp_ns=2 * MS))
+    assert wire.channel.heard_ns == 100 * MS
+    assert wire.rejected == {Reject.EPOCH: 1}
+    wire.hear(400 * MS, wire.packet(1, epoch=1003, stamp_ns=400 * MS))
+    assert wire.channel.counters.peer_restarts == 2, "a new run is another matter"
+
+
+def test_a_live_run_is_not_given_up_for_a_recording_heard_in_its_silence() -> None:
+    wire = Wire()
+    wire.hear(1 * MS, wire.packet(1))
+    wire.hear(100 * MS, wire.packet(1, epoch=7, echo_epoch=999))
+    wire.hear(101 * MS, wire.packet(2, stamp_ns=101 * MS))
+    assert wire.channel.peer_confirmed
+    assert wire.channel.heard_ns == 101 * MS

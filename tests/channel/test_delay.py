@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import pydantic
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from channel.delay import (
@@ -19,7 +19,9 @@ from channel.delay import (
     SinusoidDelay,
     TraceDelay,
     UniformDelay,
+    _read_trace,
 )
+from channel.injection import Injection
 
 NAN = math.nan
 INF = math.inf
@@ -35,6 +37,9 @@ def rng() -> np.random.Generator:
         (lambda: ConstantDelay(-0.1), "delay_s = -0.1"),
         (lambda: ConstantDelay(INF), "delay_s = inf"),
         (lambda: ConstantDelay(NAN), "delay_s = nan"),
+        (lambda: ConstantDelay(1e300), r"delay_s = 1e\+300"),
+        (lambda: SinusoidDelay(1e308, 1e308), r"mean_s = 1e\+308"),
+        (lambda: Reordering(0.1, 1e300), r"extra_s = 1e\+300"),
         (lambda: ConstantDelay(0.1, model="sinusoid"), "model = 'sinusoid'"),  # type: ignore[arg-type]
         (lambda: SinusoidDelay(0.1, 0.2), "amplitude_s = 0.2"),
         (lambda: SinusoidDelay(0.1, -0.1), "amplitude_s = -0.1"),
@@ -134,6 +139,47 @@ def test_bad_traces_are_named(tmp_path: Path, text: str, complaint: str) -> None
 def test_a_missing_trace_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"missing\.csv.*cannot be read"):
         _ = TraceDelay(str(tmp_path / "missing.csv")).bound_s
+
+
+def test_a_trace_without_end_is_not_read() -> None:
+    with pytest.raises(ValueError, match=r"/dev/zero.*no such file"):
+        _ = TraceDelay("/dev/zero").bound_s
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    header=st.sampled_from([b"time_s,delay_s\n", b"delay_s,time_s\n", b"", b"time_s,time_s\n"]),
+    rows=st.lists(
+        st.lists(
+            st.floats().map(lambda x: repr(x).encode())
+            | st.integers(0, 100).map(lambda x: b"%d" % x)
+            | st.binary(max_size=6)
+            | st.sampled_from([b'"', b"1e999", b"\0", b"1_0", b" 3 ", b"0x1", b"\xff"]),
+            max_size=3,
+        ).map(b",".join),
+        max_size=5,
+    ),
+)
+def test_any_csv_is_a_delay_within_its_bound_or_a_value_error(
+    tmp_path: Path, header: bytes, rows: list[bytes]
+) -> None:
+    file = tmp_path / "junk.csv"
+    file.write_bytes(header + b"\n".join(rows))
+    _read_trace.cache_clear()
+    delay = TraceDelay(str(file))
+    try:
+        bound_s = delay.bound_s
+    except ValueError as error:
+        complaint = str(error)
+    else:
+        complaint = None
+    if complaint is not None:
+        assert "junk.csv" in complaint
+        return
+    assert math.isfinite(bound_s)
+    for time_s in (-1e9, 0.0, 0.5, 1e9):
+        assert 0.0 <= delay.at(time_s, rng()) <= bound_s
+    Injection(Direction(delay), "exact", session_start_ns=0, seed=(1,))
 
 
 def test_direction_bound_counts_what_is_held_back() -> None:

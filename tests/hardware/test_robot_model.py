@@ -484,6 +484,8 @@ def test_missing_and_broken_files_are_refused(tmp_path: Path) -> None:
         build_robot(UrdfArm("urdf", "nowhere.urdf", "tool"), tmp_path)
     (tmp_path / "broken.urdf").write_text("<robot")
     with pytest.raises(DeviceConfigurationError, match="cannot be read as URDF"):
+        build_robot(UrdfArm("urdf", "/proc/self/mem", "tip"), None)
+    with pytest.raises(DeviceConfigurationError, match="cannot be read as URDF"):
         build_robot(UrdfArm("urdf", "broken.urdf", "tool"), tmp_path)
     with pytest.raises(DeviceConfigurationError, match="gravity_m_s2"):
         UrdfArm("urdf", "any.urdf", "tool", gravity_m_s2=(0.0, math.nan, 0.0))

@@ -854,3 +854,12 @@ def test_every_change_of_state_is_an_event(bench: Bench) -> None:
         "ENGAGED: both sites agree",
         "FAULT: DeviceError: too hot",
     ]
+
+
+def test_de_rating_and_its_end_are_told(bench: Bench) -> None:
+    bench.engage()
+    for age_ns in (500 * MS, 100 * MS):
+        bench.site.margin.share = lambda _, age_ns=age_ns: 0.5 if age_ns > 400 * MS else 1.0  # type: ignore[method-assign]
+        bench.tick(50)
+    told = [text.split(":")[0] for text in bench.said()]
+    assert told[-2:] == ["de-rated", "full gains"]

@@ -1,6 +1,7 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from site_runtime.guard import Cut
 from site_runtime.session import LoopSettings, load_session
 from site_runtime.site import Site
 from site_runtime.status import StatusLine, describe, summary
+from site_runtime.supervisor import State
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -110,3 +112,31 @@ def test_quiet_prints_nothing(fresh: Site, capsys: pytest.CaptureFixture[str]) -
     with StatusLine(fresh, quiet=True) as line:
         assert not line._thread.is_alive()
     assert capsys.readouterr().err == ""
+
+
+class TroubledRecorder:
+    folder = "/state/[demo]/local"
+    incidents = 2
+    trouble = "not recording: [Errno 28] No space left on device, 7 rows not recorded"
+
+
+def test_the_line_and_the_summary_say_what_the_recorder_could_not_do(fresh: Site) -> None:
+    recorder: Any = TroubledRecorder()
+    assert describe(fresh, 100.0, recorder).endswith(recorder.trouble)
+    console = Console(file=io.StringIO(), width=160)
+    summary(fresh, console, recorder)
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    assert recorder.trouble in text
+    assert "2 kept in /state/[demo]/local" in text
+    recorder.trouble = None
+    assert "record" not in describe(fresh, 100.0, recorder)
+
+
+def test_the_line_warns_of_gains_that_are_de_rated(fresh: Site) -> None:
+    fresh._supervisor.state = State.ENGAGED
+    assert "DE-RATED" not in describe(fresh, 100.0)
+    fresh._supervisor._scale = 0.6
+    assert "DE-RATED to 60%" in describe(fresh, 100.0)
+    fresh._supervisor.state = State.READY
+    assert "DE-RATED" not in describe(fresh, 100.0)

@@ -99,6 +99,7 @@ def make_run(seconds: float = 12.0, dimension: int = 2, seed: int = 3) -> Run:
         row["one_way_delay_s"] = np.where(seen < 0, np.nan, delay_s[site])
         row["round_trip_s"] = delay_s["local"] + delay_s["remote"]
         row["round_trip_s"][t < 0.4] = np.nan
+        row["loop_bound_s"] = row["round_trip_s"] + 0.03
         row["certified_round_trip_s"] = 0.4
         row["manipulability"] = 0.1
         row["link_distance_m"] = np.linalg.norm(x - (0.25, -0.1), axis=1) - 0.02

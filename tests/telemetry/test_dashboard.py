@@ -146,7 +146,7 @@ def test_every_signal_is_recorded_bit_for_bit(run: Any, recording: Recording) ->
             ),
             "torque": rows["torque_nm"],
             "delay": rows["one_way_delay_s"] * 1e3,
-            "round_trip": rows["round_trip_s"] * 1e3,
+            "round_trip": rows["loop_bound_s"] * 1e3,
             "lateness": rows["lateness_ns"] * 1e-3,
             "angle": rows["q"],
             "speed": rows["q_dot"],
@@ -467,7 +467,7 @@ def test_the_viewer_shows_every_view(
         "Force [N]": (LOCAL_COLOUR, REMOTE_COLOUR),
         "Joint torque [N·m]": (LOCAL_COLOUR, REMOTE_COLOUR),
         "One-way delay [ms]": (LOCAL_COLOUR, REMOTE_COLOUR),
-        "Round trip [ms]": (REMOTE_COLOUR, RED),
+        "Greatest loop age [ms]": (REMOTE_COLOUR, RED),
         "Loop lateness [µs]": (LOCAL_COLOUR, REMOTE_COLOUR),
     }
     arms = {

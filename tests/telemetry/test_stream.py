@@ -81,6 +81,15 @@ def test_without_a_peer_a_plain_nan_fills_its_position() -> None:
     assert row["peer_state"] == 255
 
 
+@pytest.mark.parametrize("counter", ["lost", "late", "rejected", "missed"])
+def test_a_counter_stays_at_the_most_it_holds(counter: str) -> None:
+    """One forged packet can skip 2^64 sequence numbers; that must not stop the site."""
+    stream = stream_to([])
+    stream.put(**fields_of(0) | {counter: 2**64})
+    stream.put(**fields_of(1) | {counter: 2**32 - 1})
+    assert stream.last(2)[counter].tolist() == 2 * [2**32 - 1]
+
+
 def test_flush_publishes_full_batches_only_and_drain_the_rest() -> None:
     published: list[bytes] = []
     stream = stream_to(published)

@@ -1,0 +1,66 @@
+"""Rows and events on their way to a disk that may be slow or full: bounded, the oldest dropped."""
+
+import threading
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from telemetry.row_ring import SiteEvent
+from telemetry.rows import RowArray
+
+
+class Piece(NamedTuple):
+    """Consecutive rows, and the events among them."""
+
+    rows: RowArray
+    events: tuple[SiteEvent, ...]
+
+
+class Backlog:
+    """A queue of pieces between a thread that fills it and one that empties it."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = most_bytes
+        self._pieces: deque[Piece] = deque()
+        self._bytes = 0
+        self._dropped = 0
+        self._lock = threading.Lock()
+
+    @property
+    def dropped(self) -> int:
+        """Rows dropped so far because there was no room."""
+        return self._dropped
+
+    def put(self, piece: Piece) -> None:
+        """Add the newest piece; what there is no room for is dropped, the oldest first."""
+        with self._lock:
+            self._pieces.append(piece)
+            self._bytes += piece.rows.nbytes
+            while self._bytes > self._most_bytes:
+                oldest = self._pieces.popleft()
+                self._bytes -= oldest.rows.nbytes
+                self._dropped += len(oldest.rows)
+
+    def put_back(self, piece: Piece) -> None:
+        """Return what was taken and could not be written; the next `put` looks for its room."""
+        with self._lock:
+            self._pieces.appendleft(piece)
+            self._bytes += piece.rows.nbytes
+
+    def take(self, most_rows: int) -> Piece | None:
+        """Take the oldest pieces as one, so many rows or a single piece; None if there is none."""
+        taken: list[Piece] = []
+        rows = 0
+        with self._lock:
+            while self._pieces and (not taken or rows + len(self._pieces[0].rows) <= most_rows):
+                piece = self._pieces.popleft()
+                self._bytes -= piece.rows.nbytes
+                rows += len(piece.rows)
+                taken.append(piece)
+        if not taken:
+            return None
+        return Piece(
+            np.concatenate([piece.rows for piece in taken]),
+            tuple(event for piece in taken for event in piece.events),
+        )
