@@ -38,7 +38,6 @@ LAST_TRIES_S: Final = 5.0
 
 PIECE_ROWS: Final = 1000
 BACKLOG_BYTES: Final = 64 * 2**20
-NICE: Final = 5
 
 _PROGRAMS: Final = ("farhand", "numpy", "eclipse-zenoh", "pin", "mcap")
 _MOST_INCIDENTS: Final = 16  # that wait for a disk that fails
@@ -288,7 +287,6 @@ def _be_ordinary() -> None:
     # The site ends this process in its own time, and a service manager tells every process of it.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    os.nice(NICE)
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with suppress(OSError):

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from site_runtime.keys import SiteId
 from site_runtime.session import Session, load_session
 from site_runtime.supervisor import State
-from telemetry.rows import RowArray
+from telemetry.rows import RowArray, row_dtype
 from tests.faults import router as routing
 from tests.faults import wall_clock
 from tests.faults.companion import ROOT, Companion
@@ -171,7 +173,9 @@ class SitePair:
         return self.rows_of(self.daemons[site], since_ns)
 
     def rows_of(self, daemon: Daemon, since_ns: int = 0) -> RowArray:
-        """Rows of one daemon."""
+        """Rows of one daemon; none of one that ended before it was heard."""
+        if not daemon.epoch:
+            return np.empty(0, row_dtype(2, 2))
         return self._recordings[daemon.site].rows(daemon.site, daemon.epoch, since_ns)
 
     def state(self, site: SiteId) -> str:

@@ -395,7 +395,9 @@ def test_the_recorder_stands_back_and_stays(run: Run, folder: Path) -> None:
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         os.kill(pid, number)
     assert os.sched_getscheduler(pid) == os.SCHED_OTHER
-    assert os.getpriority(os.PRIO_PROCESS, pid) >= 5
+    assert os.getpriority(os.PRIO_PROCESS, pid) == os.getpriority(os.PRIO_PROCESS, 0), (
+        "any job on the machine would go first"
+    )
     assert os.getsid(pid) == pid
     put(run.stream, 100)
     run.until_written()
