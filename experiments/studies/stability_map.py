@@ -71,6 +71,7 @@ _MAPS = (
         {
             "local.operator": None,
             "remote.environment": None,
+            "engagement.beyond_certificate": "warn",
             **both_ways("loss", None),
         },
     ),
