@@ -11,6 +11,6 @@ def smooth_ramp(elapsed_s: float, duration_s: float) -> tuple[float, float]:
     if elapsed_s <= 0.0:
         return 0.0, 0.0
     x = elapsed_s / duration_s
-    value = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+    value = min(x * x * x * (10.0 + x * (6.0 * x - 15.0)), 1.0)  # else 1 + 1e-16 near the end
     rate = 30.0 * (x * (1.0 - x)) ** 2 / duration_s
     return value, rate

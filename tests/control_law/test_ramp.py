@@ -29,3 +29,9 @@ def test_rises_and_its_rate_is_its_derivative() -> None:
 def test_two_derivatives_are_continuous_at_the_ends() -> None:
     for end, inside in ((0.0, 1e-6), (2.0, 2.0 - 1e-6)):
         assert smooth_ramp(inside, 2.0)[1] == pytest.approx(smooth_ramp(end, 2.0)[1], abs=1e-9)
+
+
+def test_a_ramp_never_exceeds_one_by_rounding() -> None:
+    for duration_s in (0.05, np.nextafter(0.05, 1.0), 0.2, 1.0, 3.0):
+        for left in np.geomspace(1e-16, 1.0, 2000):
+            assert 0.0 <= smooth_ramp(duration_s * (1.0 - left), duration_s)[0] <= 1.0

@@ -476,3 +476,24 @@ def test_what_cannot_start_says_why_and_exits_with_two(rig: Rig) -> None:
         for word in words:
             assert word in daemon.text()
         assert "Traceback" not in daemon.text()
+
+
+def test_a_signal_stops_both_sites_and_another_resets_each(rig: Rig) -> None:
+    session = rig.session()
+    daemons = {site: rig.start(site, session, "--quiet") for site in BOTH}
+    rig.until_converged()
+    daemons[LOCAL].process.send_signal(signal.SIGUSR1)
+    for site in BOTH:
+        rig.until_state(site, State.EMERGENCY_STOP)
+        stopped = rig.until_more(site, 50)
+        assert (stopped["state"] == State.EMERGENCY_STOP).all()
+        assert (stopped["torque_nm"] == 0.0).all()
+
+    # one that is reset waits for the other
+    daemons[LOCAL].process.send_signal(signal.SIGUSR2)
+    rig.until_state(LOCAL, State.READY)
+    assert (rig.until_more(LOCAL, 100)["torque_nm"] == 0.0).all()
+    assert rig.state(REMOTE) is State.EMERGENCY_STOP
+    daemons[REMOTE].process.send_signal(signal.SIGUSR2)
+    rig.until_converged()
+    assert [daemon.stop() for daemon in daemons.values()] == [0, 0]

@@ -231,11 +231,13 @@ def test_above_the_energy_limit_no_power_is_fed_and_below_it_nothing_is_cut(
     asked_w = (torque - gravity) @ velocity
     energy_j = 0.5 * velocity @ INERTIA @ velocity
     if energy_j <= 1.0 or asked_w <= 0.0:
-        assert np.array_equal(limited, torque)
-        assert guard.cut == Cut.NONE
+        assert limited == pytest.approx(torque, abs=1e-12)
+        if energy_j <= 1.0 or asked_w < -1e-9:
+            assert limited is torque
+            assert guard.cut == Cut.NONE
         return
     assert (limited - gravity) @ velocity == pytest.approx(0.0, abs=1e-9)
-    assert guard.cut == (Cut.KINETIC_ENERGY if asked_w > 1e-6 else guard.cut)
+    assert guard.cut == (Cut.KINETIC_ENERGY if asked_w > 1e-9 else guard.cut)
     # nothing but the component along the motion is taken
     taken = limited - torque
     assert taken - (taken @ velocity) / (velocity @ velocity) * velocity == pytest.approx(
@@ -442,16 +444,15 @@ def test_the_fault_comes_at_the_very_tick(rate_hz: int, fault_after_s: float) ->
 def test_the_excess_leaks_and_a_restart_forgets_it() -> None:
     guard = Guard(FAULTS[Cut.TORQUE], PERIOD_S)
     strong, weak = np.array([9.0, 0.0, 0.0]), np.zeros(3)
-    for torque in [strong] * 50 + [weak] * 20 + [strong] * 20:
+    histories = ([strong] * 50 + [weak] * 20 + [strong] * 20, [strong, weak] * 200 + [strong] * 50)
+    for history in histories:
+        for torque in history:
+            guard.reading(STILL)
+            guard.torque(torque, robot_at())
         guard.reading(STILL)
-        guard.torque(torque, robot_at())
-    guard.restart()
-    for torque in [strong, weak] * 200 + [weak] * 3 + [strong] * 50:
-        guard.reading(STILL)
-        guard.torque(torque, robot_at())
-    guard.reading(STILL)
-    with pytest.raises(GuardError):
-        guard.torque(strong, robot_at())
+        with pytest.raises(GuardError):
+            guard.torque(strong, robot_at())
+        guard.restart()
 
 
 @pytest.mark.parametrize("cut", [Cut.JOINT, Cut.WORKSPACE], ids=lambda cut: str(cut.name))
