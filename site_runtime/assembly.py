@@ -24,6 +24,12 @@ from site_runtime.supervisor import EngagementRules, Supervisor
 from telemetry.row_ring import Memory
 from telemetry.stream import TelemetryStream
 
+TAKEOVER_NS = 1_000_000_000
+"""Silence after which another run may take the peer's place.
+
+No start is quicker, and a brief outage must not hand the robot to a second operator who waits.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
@@ -94,7 +100,7 @@ def assemble(
             epoch=surroundings.epoch,
             dimension=z,
             send_period_ns=session.send_period_ns,
-            silence_ns=hold_after_ns,
+            silence_ns=max(TAKEOVER_NS, hold_after_ns),
             session_start_ns=start_ns,
             direction=inbound,
             mode=session.channel.injection,

@@ -126,6 +126,21 @@ def second_local(stage: Stage) -> None:
     pair.end(second)
 
 
+def second_local_in_wait(stage: Stage) -> None:
+    """Another local site is there while the first is silent for half a second."""
+    pair = stage.pair
+    second = pair.start_second(LOCAL)
+    since_ns = stage.fault()
+    pair.signal(LOCAL, signal.SIGSTOP)
+    pair.until_left(REMOTE, since_ns)
+    time.sleep(0.4)
+    stage.fault(LOCAL)
+    pair.signal(LOCAL, signal.SIGCONT)
+    time.sleep(2.0)
+    stage.never_driven(second, "the second local")
+    pair.end(second)
+
+
 def other_session(stage: Stage) -> None:
     """The local site comes back with a session file of other gains."""
     pair = stage.pair
@@ -251,6 +266,10 @@ SCENARIOS = (
     Scenario("local operator stops", ON_LOOPBACK, stopped(LOCAL), STOPPED, STOPPED, BOTH),
     Scenario("remote operator stops", ON_LOOPBACK, stopped(REMOTE), STOPPED, STOPPED, BOTH),
     Scenario("second local", ON_LOOPBACK, second_local, UNDISTURBED, UNDISTURBED),
+    Scenario(
+        "second local in wait", ON_LOOPBACK, second_local_in_wait, RESUMED, HELD_AND_SHAKEN,
+        (REMOTE,),
+    ),
     Scenario("recording to live sites", ON_LOOPBACK, replay_to_live, UNDISTURBED, UNDISTURBED),
     Scenario("flood in the local's name", ON_LOOPBACK, flooded(LOCAL), SHAKEN, SHAKEN),
     Scenario("flood in the remote's name", ON_LOOPBACK, flooded(REMOTE), SHAKEN, SHAKEN),
