@@ -207,7 +207,7 @@ def test_a_recorder_held_up_for_seconds_loses_nothing(daemon: Daemon) -> None:
     os.kill(pid, signal.SIGCONT)
     assert daemon.stop() == 0
     daemon.until(lambda: daemon.recorded().complete, "the recorder's end")
-    assert "recorder lost" not in daemon.text()
+    assert "rows not recorded" not in daemon.text()
     recording = daemon.recorded()
     assert recording.gaps == ()
     assert recording.rows["sequence"][-1] > 1000
