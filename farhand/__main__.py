@@ -8,6 +8,7 @@ from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.info import info
 from farhand.reproduce import reproduce
 from farhand.simulate import simulate
 from local_site.daemon import local
@@ -26,6 +27,7 @@ for command in (
     dashboard,
     demo,
     simulate,
+    info,
     certify,
     design,
     reproduce,

@@ -36,6 +36,7 @@ def farhand(*arguments: str | float | Path) -> Result:
         "dashboard",
         "demo",
         "simulate",
+        "info",
         "certify",
         "design",
         "reproduce",
