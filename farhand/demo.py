@@ -7,8 +7,8 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
-from math import isnan
+from contextlib import closing, contextmanager
+from math import inf, isnan
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +21,8 @@ from farhand.console import ERR, user_errors
 from farhand.dashboard import POLL_S, Port, Save, WebPort, shown
 from farhand.feed import Feed
 from farhand.picture import picture_of
-from site_runtime.daemon import Duration
+from site_runtime.clock import SteadyClock
+from site_runtime.daemon import Duration, StopSignals
 from site_runtime.keys import SiteId
 from site_runtime.session import load_session
 from site_runtime.supervisor import State
@@ -58,14 +59,14 @@ def demo(
             transient=True,
         )
         with (
-            suppress(KeyboardInterrupt),
+            StopSignals(SteadyClock(), None) as signals,
             shown(loaded, save, port, web_port) as board,
             _sites(session, endpoints) as processes,
             closing(Feed(loaded, tuple(endpoints.values()))) as feed,
             status,
         ):
-            end_s = None if duration is None else time.monotonic() + duration
-            while end_s is None or time.monotonic() < end_s:
+            end_s = inf if duration is None else time.monotonic() + duration
+            while time.monotonic() < end_s and not signals.asked_to_stop():
                 for batch, arrival_ns in feed.receive():
                     board.offer(batch, arrival_ns)
                     newest[batch.site] = batch
