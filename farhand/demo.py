@@ -83,7 +83,7 @@ def demo(
 def _sites(
     session: Path, endpoints: dict[SiteId, str]
 ) -> Iterator[dict[SiteId, subprocess.Popen[str]]]:
-    """Both daemons as processes; ended by Ctrl-C as a person would, their summaries printed."""
+    """Both daemons as processes; ended as a service would be, their summaries printed."""
     processes: dict[SiteId, subprocess.Popen[str]] = {}
     try:
         for site in (SiteId.REMOTE, SiteId.LOCAL):
@@ -101,7 +101,7 @@ def _sites(
         yield processes
     finally:
         for process in processes.values():
-            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM)  # quiet also where it has not come to its handlers
         for process in processes.values():
             _end(process)
 
