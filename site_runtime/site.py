@@ -158,10 +158,7 @@ class Site:
             self.channel.send(now_ns, state, self._told_m, terms.X_dot, force_n)
             self._put(now_ns, lateness_ns, reading, peer, terms, command, torque_nm, share)
         except Exception as failure:
-            self._device.stop()
-            self._supervisor.fault()
-            self.failure = failure
-            self.telemetry.event(now_ns, f"FAULT: {type(failure).__name__}: {failure}")
+            self._fail(now_ns, failure)
         self.ticks += 1
         self._duration_ns = self._clock.now_ns() - now_ns
 
@@ -238,15 +235,19 @@ class Site:
             self._device.close()
             self._device.open()
         except Exception as failure:
-            self._device.stop()
-            self._supervisor.fault()
-            self.failure = failure
-            self.telemetry.event(now_ns, f"FAULT: {type(failure).__name__}: {failure}")
+            self._fail(now_ns, failure)
             return
         self.failure = None
         self._late_ticks = 0
         self._supervisor.reset()
         self.telemetry.event(now_ns, "READY: " + self._supervisor.cause.value)
+
+    def _fail(self, now_ns: int, failure: Exception) -> None:
+        """Stop the device first; then latch FAULT and tell why."""
+        self._device.stop()
+        self._supervisor.fault()
+        self.failure = failure
+        self.telemetry.event(now_ns, f"FAULT: {type(failure).__name__}: {failure}")
 
     def _say(self, now_ns: int) -> None:
         rest = np.zeros(self._robot.task_dimension)
