@@ -6,11 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from control_law.certificates import (
+    best,
     relaxation_theorem_a,
     relaxation_theorem_b,
     required_scale,
 )
-from site_runtime.certification import certify, site_gains
+from site_runtime.certification import hold_of, site_gains
 from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of
 from site_runtime.session import Session
@@ -62,7 +63,7 @@ def margin_of(session: Session) -> Margin:
     coupling = coupling_of(session.coupling)
     local, remote = (site_gains(session, site) for site in SiteId)
     return Margin(
-        certify(session).best.round_trip_s,
+        best(coupling, local, remote, hold_of(session)).round_trip_s,
         tuple(
             (relaxation(coupling, local), relaxation(coupling, remote))
             for relaxation in (relaxation_theorem_a, relaxation_theorem_b)
