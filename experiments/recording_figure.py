@@ -40,9 +40,13 @@ _SHADES: Final = MappingProxyType(
 _OTHER: Final = "#7a7a7a"
 _LIMIT: Final = "#c02f2f"
 _APART: Final = "#222222"
+_GAP_STYLE: Final[Mapping[str, Any]] = MappingProxyType(
+    {"facecolor": "#f4f4f4", "edgecolor": "#c4c4c4", "hatch": "///", "linewidth": 0.6, "zorder": 0}
+)
 _WIDTH_IN: Final = 14.0
 _PANEL_IN: Final = 2.2
 _BANDS_IN: Final = 1.1
+_LINEAR_US: Final = 100.0  # the scale is logarithmic above
 _JOINTS_A_COLUMN: Final = 8
 _NAMED_SHARE: Final = 0.06  # of the width, from which a band has room for its name
 
@@ -85,8 +89,11 @@ def recording_figure(
         PANELS[name](_Panel(place, traces, state_names))
         place.set_xlim(start_s, max(end_s, start_s + 1e-3))
         place.tick_params(labelsize=8)
-        for gap_s in _gaps_s(traces):
-            place.axvspan(*gap_s, color="#f2f2f2", hatch="//", edgecolor="#d0d0d0", linewidth=0.0)
+        place.broken_barh(
+            _gaps_s(traces), (0, 1), transform=place.get_xaxis_transform(), **_GAP_STYLE
+        )
+    for place in axes[:-1]:
+        place.tick_params(labelbottom=False)
     axes[-1].set_xlabel("session time [s]", fontsize=9)
     save(figure, file)
 
@@ -102,10 +109,7 @@ class _Panel:
     def curve(
         self, trace: SiteTrace, values: FloatArray, label: str, colour: str, style: str = "-"
     ) -> None:
-        time_s, shown = _outline(trace, values)
-        self.axes.plot(
-            time_s, shown, style, label=label, color=colour, linewidth=1.1, solid_joinstyle="round"
-        )
+        self.axes.plot(*_outline(trace, values), style, label=label, color=colour, linewidth=1.1)
 
     def legend(self, columns: int = 1) -> None:
         """Put the legend beside the curves."""
@@ -124,13 +128,8 @@ class _Panel:
         """Name the axis, add what all panels have, and let the axis begin at `floor`."""
         self.axes.set_ylabel(label, fontsize=9)
         self.axes.grid(alpha=0.3)
-        self.axes.legend(
-            fontsize=8,
-            loc="upper left",
-            bbox_to_anchor=(1.0, 1.02),
-            frameon=False,
-            handlelength=1.4,
-        )
+        if self.axes.get_legend() is None:
+            self.legend()
         if floor is not None:
             self.axes.set_ylim(bottom=floor)
 
@@ -216,8 +215,9 @@ def _draw_lateness(panel: _Panel) -> None:
     for trace in panel.traces:
         late_us = 1e-3 * trace.fields["lateness_ns"]
         panel.curve(trace, late_us, trace.site, _SHADES[trace.site][0])
-    panel.axes.set_yscale("symlog", linthresh=100.0)
+    panel.axes.set_yscale("symlog", linthresh=_LINEAR_US)
     panel.finish("lateness [µs]", 0.0)
+    panel.axes.set_ylim(top=max(_LINEAR_US, panel.axes.get_ylim()[1]))
 
 
 PANELS: Final[Mapping[str, Callable[[_Panel], None]]] = MappingProxyType(
@@ -253,13 +253,14 @@ def _outline(trace: SiteTrace, values: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _breaks(trace: SiteTrace) -> npt.NDArray[np.intp]:
-    """First row after each gap, and of each further run."""
+    """Return the first row after each gap, and of each further run."""
     return np.flatnonzero(np.diff(trace.fields["sequence"].astype(np.int64)) != 1) + 1
 
 
 def _gaps_s(traces: Sequence[SiteTrace]) -> list[tuple[float, float]]:
+    """Start and length [s] of what is missing."""
     return [
-        (float(trace.time_s[row - 1]), float(trace.time_s[row]))
+        (float(trace.time_s[row - 1]), float(trace.time_s[row] - trace.time_s[row - 1]))
         for trace in traces
         for row in _breaks(trace)
     ]

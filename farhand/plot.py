@@ -65,9 +65,10 @@ def _read(files: list[Path], number: int | None) -> tuple[str, list[SiteTrace]]:
 def _title(take: Take) -> str:
     start_ns, end_ns = take.span_ns
     start = datetime.fromtimestamp((start_ns + take.zero_wall_ns) // 10**9, UTC)
+    gaps = sum(len(run.gaps) for run in take.runs)
     return (
         f"{take.metadata['session']} · {start:%Y-%m-%d %H:%M:%S} UTC · "
-        f"{(end_ns - start_ns) * 1e-9:.1f} s"
+        f"{(end_ns - start_ns) * 1e-9:.1f} s" + (f" · {gaps} gaps, hatched" if gaps else "")
     )
 
 

@@ -126,10 +126,10 @@ def _table(columns: Sequence[tuple[pa.Field, pa.Array]], metadata: dict[str, str
 
 
 def _named(table: pa.Table) -> pa.Table:
-    units = [field.metadata[b"unit"].decode() for field in table.schema]
-    return table.rename_columns(
-        [
-            name if unit == "1" else f"{name} [{unit}]"
-            for name, unit in zip(table.column_names, units, strict=True)
-        ]
-    )
+    """Return a table whose columns name their units: `q_1 [rad]`, `round_trip_s`."""
+    names = []
+    for field in table.schema:
+        unit = field.metadata[b"unit"].decode()
+        told = unit == "1" or field.name.endswith("_" + unit.replace("/", "_"))
+        names.append(field.name if told else f"{field.name} [{unit}]")
+    return table.rename_columns(names)

@@ -187,7 +187,7 @@ class _Run:
             int(source.metadata["epoch"]),
             self._rows,
             tuple(self._gaps),
-            self._unwritten,
+            self._backlog.dropped + self._unwritten,
             self._error,
         )
 
