@@ -3,24 +3,23 @@
 One thread offers batches, another writes them; `offer` never waits for the disk.
 """
 
-import json
-import platform
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from telemetry.alignment import SiteClock
-from telemetry.backlog import Backlog, Piece
+from telemetry.backlog import Backlog
+from telemetry.piece import Piece
+from telemetry.recorder import about_run
 from telemetry.recording import Gap, RecordingSource, RecordingWriter
 from telemetry.row_ring import SiteEvent
-from telemetry.rows import LAYOUT_VERSION, RowArray
+from telemetry.rows import RowArray
 from telemetry.segments import SEGMENT_S, segment_path
 from telemetry.stream import Batch
 from telemetry.takes import SITES
@@ -32,8 +31,6 @@ PIECE_ROWS: Final = 1000
 BACKLOG_BYTES: Final = 64 * 2**20
 MOST_RUNS: Final = 16
 """Of one session; who claims to have started more often is not recorded."""
-
-_PROGRAMS: Final = ("farhand", "numpy", "eclipse-zenoh", "mcap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +62,8 @@ class NetworkRecorder:
     ) -> None:
         self._folder = folder
         self._session_text = session_text
-        self._metadata = {
-            "source": "network",
-            "session": session_name,
-            "layout_version": str(LAYOUT_VERSION),
-            "states": json.dumps({str(number): name for number, name in states.items()}),
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            **{name: version(name) for name in _PROGRAMS},
-        }
+        self._session_name = session_name
+        self._states = states
         self._backlog_bytes = backlog_bytes
         self._runs: dict[tuple[int, int, int, int], _Run] = {}
         self._notices: deque[str] = deque(maxlen=1000)
@@ -117,7 +107,8 @@ class NetworkRecorder:
             batch.dimension,
             0,  # not known before some batches came
             self._session_text,
-            self._metadata | {"digest": f"{batch.digest:016x}", "epoch": str(batch.epoch)},
+            about_run(self._session_name, batch.digest, batch.epoch, self._states)
+            | {"source": "network"},
         )
 
     def _write(self) -> None:
@@ -165,7 +156,7 @@ class _Run:
             return False
         while (piece := self._backlog.take(PIECE_ROWS)) is not None:
             try:
-                self._write_rows(piece.rows)
+                self._write_piece(piece)
             except OSError as error:
                 self._backlog.put_back(piece)
                 self._fail(error)
@@ -191,24 +182,24 @@ class _Run:
             self._error,
         )
 
-    def _write_rows(self, rows: RowArray) -> None:
+    def _write_piece(self, piece: Piece) -> None:
         if self._segment is not None and time.monotonic() >= self._segment_end_s:
             self._close_segment()
         segment = self._segment or self._open_segment()
-        gaps = _gaps(rows, self._newest)
-        told = [f"{gap.rows} rows lost from row {gap.first} on" for gap, _ in gaps]
-        events = [
+        found = _gaps(piece.rows, self._newest)
+        told = [f"{gap.rows} rows lost from row {gap.first} on" for gap, _ in found]
+        events = tuple(
             SiteEvent(stamp_ns, f"recorder: {text}")
-            for text, (_, stamp_ns) in zip(told, gaps, strict=True)
-        ]
-        segment.write(rows, events)
+            for text, (_, stamp_ns) in zip(told, found, strict=True)
+        )
+        segment.write(piece._replace(events=events))
         segment.flush()
         if self._error:
             self._error = ""
             self._tell("recording again")
-        self._rows += len(rows)
-        self._newest = int(rows["sequence"][-1])
-        self._gaps += [gap for gap, _ in gaps]
+        self._rows += len(piece.rows)
+        self._newest = int(piece.rows["sequence"][-1])
+        self._gaps += [gap for gap, _ in found]
         for text in told:
             self._tell(text)
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from telemetry.recording import Recording, read_recording
+from telemetry.recording import Recording, joined, read_recording
 from telemetry.rows import TelemetryError
 
 
@@ -24,11 +24,21 @@ def recording_files(paths: Iterable[Path]) -> list[Path]:
 def recorded_runs(files: Iterable[Path]) -> list[Recording]:
     """Join the segments of each run of each site, in the order of their first rows.
 
-    A run without rows is left out. TelemetryError as of `read_recording`.
+    A run without rows is left out. TelemetryError if a file is no recording, or two are by
+    different recorders of one run.
     """
-    segments: dict[tuple[str, str], list[Path]] = {}
+    segments: dict[tuple[str, str], list[Recording]] = {}
     for file in files:
         for site, recording in read_recording(file).items():
-            segments.setdefault((site, recording.metadata["epoch"]), []).append(file)
-    runs = [read_recording(*paths)[site] for (site, _), paths in segments.items()]
+            run = segments.setdefault((site, recording.metadata["epoch"]), [])
+            if run and run[0].metadata != recording.metadata:
+                raise TelemetryError(
+                    f"{file} is a second recording of a run: give those of one recorder"
+                )
+            run.append(recording)
+    runs = [joined(sorted(run, key=_first_row)) for run in segments.values()]
     return sorted((run for run in runs if len(run.rows)), key=lambda run: int(run.wall_times_ns[0]))
+
+
+def _first_row(segment: Recording) -> int:
+    return int(segment.rows["sequence"][0]) if len(segment.rows) else -1

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from site_runtime.session import Session
 from site_runtime.supervisor import State
+from telemetry.piece import Piece
 from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import LAYOUT_VERSION, RowArray
@@ -40,9 +41,9 @@ def record(
     shape = (rows["q"].shape[1], rows["position_m"].shape[1])
     source = RecordingSource(site, *shape, wall_offset_ns, session.text, told | metadata)
     writer = RecordingWriter(path, source)
-    writer.write(rows[:0], events)
+    writer.write(Piece(rows[:0], tuple(events)))
     for start in range(0, len(rows), 100):
-        writer.write(rows[start : start + 100], ())
+        writer.write(Piece(rows[start : start + 100], ()))
         writer.flush()
     if close:
         writer.close()
