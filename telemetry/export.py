@@ -71,15 +71,12 @@ def run_table(take: Take, run: Recording) -> pa.Table:
 def event_table(take: Take) -> pa.Table:
     """Return what the sites, and their recorders, said, in the order of time."""
     told = sorted(
-        (event.stamp_ns + int(run.metadata["wall_offset_ns"]), run.metadata["site"], event.text)
+        (event.stamp_ns + take.offset_ns(run), run.metadata["site"], event.text)
         for run in take.runs
         for event in run.events
     )
-    walls_ns = np.array([wall_ns for wall_ns, _, _ in told], np.int64)
-    columns = [
-        _column(TIME_COLUMN, (walls_ns - take.zero_wall_ns) * 1e-9, "s", _SESSION_TIME),
-        _column(WALL_COLUMN, walls_ns, "ns", _WALL_TIME),
-    ]
+    times_ns = np.array([time_ns for time_ns, _, _ in told], np.int64)
+    columns = [_column(TIME_COLUMN, times_ns * 1e-9, "s", _SESSION_TIME)]
     for name, values, meaning in (
         ("site", [site for _, site, _ in told], "Who said it"),
         ("text", [text for _, _, text in told], "What was said"),

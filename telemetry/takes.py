@@ -27,7 +27,7 @@ class Take:
 
     Usually one of each site; a site that was started again has several, one not recorded none.
     Times are the session's, as the dashboard shows them: `time_ns` of the run that gives the time,
-    the local site's first if there is one. The sites' clocks meet on the wall clock.
+    the local site's first if there is one.
     """
 
     runs: tuple[Recording, ...]
@@ -49,13 +49,33 @@ class Take:
     @property
     def zero_wall_ns(self) -> int:
         """Wall clock at session time zero [ns since 1970]."""
-        timekeeper = (self.of("local") or self.runs)[0]
+        timekeeper = self._timekeeper
         return int(timekeeper.wall_times_ns[0]) - int(timekeeper.rows["time_ns"][0])
+
+    def offset_ns(self, run: Recording) -> int:
+        """Return what put on a stamp of one of its runs gives session time [ns].
+
+        By the wall clocks; unless the timekeeper measured, to within less, that they disagree.
+        """
+        timekeeper, offset_ns = self._timekeeper, int(run.metadata["wall_offset_ns"])
+        if run.metadata["site"] != timekeeper.metadata["site"]:
+            rows = timekeeper.rows
+            known = rows[rows["clock_uncertainty_ns"] >= 0]
+            if len(known):
+                measured_ns = int(np.median(known["clock_offset_ns"]))
+                measured_ns += int(timekeeper.metadata["wall_offset_ns"])
+                if abs(measured_ns - offset_ns) > np.median(known["clock_uncertainty_ns"]):
+                    offset_ns = measured_ns
+        return offset_ns - self.zero_wall_ns
 
     def times_ns(self, run: Recording) -> IntArray:
         """Session time (r,) [ns] of the rows of one of its runs."""
-        times: IntArray = run.wall_times_ns - self.zero_wall_ns
+        times: IntArray = run.rows["stamp_ns"] + self.offset_ns(run)
         return times
+
+    @property
+    def _timekeeper(self) -> Recording:
+        return (self.of("local") or self.runs)[0]
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -54,6 +54,25 @@ def test_both_sites_are_on_the_local_site_s_session_time(write: Writer, run) -> 
     assert "2025-11-24 16:00:00 UTC, 0.4 s: local 400 rows, remote 400 rows" in describe(take)
 
 
+def test_wall_clocks_that_the_sites_measured_to_disagree_do_not_part_them(
+    write: Writer, run
+) -> None:
+    local = run.local[:400].copy()
+    local["clock_uncertainty_ns"] = 2 * MS
+    local["clock_offset_ns"] = (5_000 - 91_000) * MS + 300_000  # of the remote clock, 0.3 ms off
+    local["clock_uncertainty_ns"][:50] = -1
+    local["clock_offset_ns"][:50] = 0
+    write("a", "local", local)
+    # 50 ms off, more than the uncertainty; a millisecond, less
+    for name, later_ns, seen_ns in (("a", 50 * MS, 300_000), ("b", 1 * MS, 1 * MS)):
+        path = write(name, "remote", run.remote[:400], later_ns=later_ns)
+        take = read_take([write.folder])
+        [other] = take.of("remote")
+        assert np.array_equal(take.times_ns(other), run.local["time_ns"][:400] + seen_ns)
+        assert take.offset_ns(take.of("local")[0]) == -5_000 * MS
+        path.unlink()
+
+
 def test_a_site_alone_gives_its_own_time(write: Writer, run) -> None:
     take = read_take([write("a", "remote", run.remote[1000:1200])])
     assert take.span_ns == (1000 * MS, 1199 * MS)
