@@ -184,6 +184,19 @@ def test_nothing_heard_is_told_and_no_success(
         assert result.output.count(f"{site}: nothing heard for 0.2 s") == 1
 
 
+def test_silence_and_its_end_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record_command, "SILENT_S", 0.2)
+    hearing = record_command._Hearing()
+    assert hearing.changes() == []
+    time.sleep(0.3)
+    hearing.heard(SiteId.LOCAL)
+    assert hearing.changes() == ["remote: nothing heard for 0.2 s"]
+    assert hearing.changes() == []
+    hearing.heard(SiteId.REMOTE)
+    hearing.heard(SiteId.REMOTE)
+    assert hearing.changes() == ["remote: heard again"]
+
+
 def test_a_folder_that_holds_recordings_is_added_to_only_by_force(tmp_path: Path) -> None:
     (tmp_path / "rows-x-local.mcap").touch()
     wish = (DEMO, "--out", tmp_path, "--duration", "0.2", "--connect", "tcp/127.0.0.1:1")

@@ -137,6 +137,16 @@ def test_segments_are_joined_in_whatever_order_they_are_named(write: Writer, run
     assert [(gap.first, gap.rows) for gap in joined.gaps] == [(100, 10)]
 
 
+def test_two_recordings_of_one_run_are_not_put_together(
+    write: Writer, run, session: Session
+) -> None:
+    write("a", "local", run.local[:100])
+    path = write.folder / "rows-b-local.mcap"
+    record(path, "local", run.local[:100], session, source="network")
+    with pytest.raises(TelemetryError, match="second recording of a run"):
+        read_take([write.folder])
+
+
 def test_recordings_of_different_sessions_are_told_by_name(
     write: Writer, run, session: Session
 ) -> None:
