@@ -26,7 +26,7 @@ import numpy as np
 
 from telemetry.backlog import Backlog
 from telemetry.incidents import Incident, IncidentWatch
-from telemetry.piece import Piece
+from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import RecorderStatus, RowRing, SiteEvent
 from telemetry.rows import LAYOUT_VERSION, RowArray
@@ -150,8 +150,10 @@ class Recorder:
 
     def _arrivals_for(self, rows: RowArray) -> RowArray:
         """Take what arrived up to the last of these rows: it is there before the row is."""
+        if not len(rows):
+            return NO_ARRIVALS
         arrivals = self._ring.arrivals_from(self._next_arrival)
-        last = rows["sequence"][-1] if len(rows) else 0
+        last = rows["sequence"][-1]
         arrivals = arrivals[: np.searchsorted(arrivals["row"], last, side="right")]
         if len(arrivals):
             self._next_arrival = int(arrivals["number"][-1]) + 1
