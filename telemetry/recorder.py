@@ -77,6 +77,22 @@ class RecorderOptions:
         return cls(**values)
 
 
+def about_run(
+    session_name: str, digest: int, epoch: int, states: Mapping[int, str]
+) -> dict[str, str]:
+    """Return what a recording tells of its run, and of the programs here."""
+    return {
+        "session": session_name,
+        "digest": f"{digest:016x}",
+        "epoch": str(epoch),
+        "layout_version": str(LAYOUT_VERSION),
+        "states": json.dumps(states),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{name: version(name) for name in _PROGRAMS},
+    }
+
+
 class Recorder:
     """One thread drains the ring into a backlog, another writes the backlog to the disk."""
 
@@ -91,16 +107,7 @@ class Recorder:
             layout.dimension,
             options.wall_offset_ns,
             options.session_text,
-            {
-                "session": options.session_name,
-                "digest": f"{layout.digest:016x}",
-                "epoch": str(layout.epoch),
-                "layout_version": str(LAYOUT_VERSION),
-                "states": json.dumps(options.states),
-                "python": platform.python_version(),
-                "platform": platform.platform(),
-                **{name: version(name) for name in _PROGRAMS},
-            },
+            about_run(options.session_name, layout.digest, layout.epoch, options.states),
         )
         self._watch = IncidentWatch(
             {n: name for n, name in options.states.items() if name in options.incident_states}
