@@ -13,6 +13,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from math import isfinite
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -169,13 +170,10 @@ def test_a_scrape_tells_how_the_pair_runs(pair: dict[SiteId, Daemon]) -> None:
         more = {name: value - before[name] for name, value in found.items()}
         ran = more["farhand_ticks_total"]
         assert ran + more["farhand_missed_ticks_total"] == pytest.approx(500, rel=0.5)
-        for counted in (
-            "farhand_wakeup_lateness_seconds",
-            "farhand_tick_duration_seconds",
-            "farhand_round_trip_seconds",
-            "farhand_one_way_delay_seconds",
-        ):
-            assert more[f"{counted}_count"] == ran
+        for counted in ("wakeup_lateness", "tick_duration"):
+            assert (counted, more[f"farhand_{counted}_seconds_count"]) == (counted, ran)
+        for counted in ("round_trip", "one_way_delay"):  # not known in each of the first ticks
+            assert 0.9 * ran <= more[f"farhand_{counted}_seconds_count"] <= ran
         for stage in ("read", "step", "write", "send"):
             assert 0 < more[f"farhand_stage_seconds_count {stage}"] <= ran
             assert more[f"farhand_stage_seconds_sum {stage}"] > 0
@@ -184,7 +182,7 @@ def test_a_scrape_tells_how_the_pair_runs(pair: dict[SiteId, Daemon]) -> None:
         waited = more["farhand_hold_seconds_sum"] + more["farhand_network_delay_seconds_sum"]
         one_way = more["farhand_one_way_delay_seconds_sum"] / ran
         assert delay_s * 0.9 < waited / samples <= one_way + 0.001
-        assert found["farhand_certified_round_trip_seconds"] == pytest.approx(0.3)
+        assert found["farhand_certified_round_trip_seconds"] == pytest.approx(0.3, abs=0.01)
         assert found["farhand_margin_seconds"] < 0.3 - 0.08
         assert found["farhand_force_share"] > 0
         assert 0 < found["farhand_clock_uncertainty_seconds"] < 1
@@ -263,24 +261,23 @@ def test_every_panel_and_every_alert_finds_its_series(
     try:
         until(
             # a rate takes two scrapes
-            lambda: (
-                [v for _, v in server.values("count_over_time(up[1m])") if v >= 3] == [3, 3]
-                or len([v for _, v in server.values("count_over_time(up[1m])") if v >= 4]) == 2
-            ),
+            lambda: len(server.values("count_over_time(up[1m]) > 3")) == len(pair),
             lambda: f"scrapes\n{server.log.read_text(encoding='utf-8')}",
         )
-        variables = {"$session": "metered", "$site": "local|remote"}
+        variables = {
+            "$session": "metered",
+            "$site": "local|remote",
+            "$__rate_interval": "10s",
+            "$__range": "10s",
+        }
         empty = []
         for title, expression in panel_expressions():
-            for variable, value in {
-                **variables,
-                "$__rate_interval": "10s",
-                "$__range": "10s",
-            }.items():
+            for variable, value in variables.items():
                 expression = expression.replace(variable, value)
             assert "$" not in expression
             found = server.values(expression)
-            if {labels.get("site") for labels, _ in found} != {"local", "remote"}:
+            sites = {labels["site"] for labels, value in found if isfinite(value)}
+            if sites != {"local", "remote"}:
                 empty.append((title, expression, found))
         assert empty == []
         state = server.values('farhand_state{session="metered"} == 1')
@@ -314,7 +311,6 @@ def test_a_metrics_process_that_dies_disturbs_nothing_and_is_told(
     before = remote.scrape()
     os.kill(local.metrics_pid(), signal.SIGKILL)
     local.until_said(r"Z local  ENGAGED: no metrics: their process ended with code -9")
-    local.until_said(r"local  ENGAGED .* · no metrics: their process ended with code -9")
     after = remote.scrape()
     assert after["farhand_peer_state ENGAGED"] == 1
     for state in ("HOLD", "FAULT", "READY"):
