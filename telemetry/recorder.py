@@ -7,16 +7,12 @@ closes the other end however the site dies, and what the site had put is still i
 
 import json
 import mmap
-import os
 import platform
-import select
-import signal
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +21,7 @@ from typing import Final, Self
 import numpy as np
 
 from telemetry.backlog import Backlog
+from telemetry.companion import input_ended, stand_back
 from telemetry.incidents import Incident, IncidentWatch
 from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.recording import RecordingSource, RecordingWriter
@@ -140,7 +137,7 @@ class Recorder:
 
     def run(self, descriptor: int) -> None:
         """Record until this input ends, then all that is left."""
-        while self._writer.is_alive() and not _ended(descriptor, DRAIN_S):
+        while self._writer.is_alive() and not input_ended(descriptor, DRAIN_S):
             self.drain()
             self._report()
         self.finish()
@@ -299,25 +296,9 @@ class Recorder:
         return SiteEvent(time.monotonic_ns(), f"recorder: {text}")
 
 
-def _ended(descriptor: int, wait_s: float) -> bool:
-    readable, _, _ = select.select([descriptor], [], [], wait_s)
-    return bool(readable) and not os.read(descriptor, 1)
-
-
-def _be_ordinary() -> None:
-    """Take nothing from the loop: neither its priority nor the CPU that it stays on."""
-    # The site ends this process in its own time, and a service manager tells every process of it.
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    with suppress(OSError):
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))
-
-
 def main() -> None:
     """Record the ring in the memory whose file descriptor is the first argument."""
-    _be_ordinary()
+    stand_back()
     ring = RowRing.attach(mmap.mmap(int(sys.argv[1]), 0))
     try:
         options = RecorderOptions.from_json(sys.stdin.readline())

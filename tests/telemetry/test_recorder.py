@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from telemetry.backlog import Backlog, Piece
+from telemetry.companion import SharedMemory
 from telemetry.recorder import Recorder, RecorderOptions
-from telemetry.recorder_process import RecorderProcess, SharedMemory
+from telemetry.recorder_process import RecorderProcess
 from telemetry.recording import Recording, read_recording
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import COLUMNS, TelemetryError, row_dtype
