@@ -5,11 +5,12 @@ import time
 from pathlib import Path
 
 from site_runtime.clock import SteadyClock
-from site_runtime.session import Session
+from site_runtime.session import Session, named_files
 from site_runtime.site import Site
 from site_runtime.supervisor import State
+from telemetry.companion import SharedMemory
 from telemetry.recorder import RecorderOptions
-from telemetry.recorder_process import RecorderProcess, SharedMemory
+from telemetry.recorder_process import RecorderProcess
 
 INCIDENT_STATES = ("FAULT", "EMERGENCY_STOP")
 """Entering one of these is an incident: the rows around it are never deleted."""
@@ -35,6 +36,7 @@ def start_recorder(session: Session, site: Site, memory: SharedMemory) -> Record
             keep_s=session.recorder.keep_s,
             session_name=session.name,
             session_text=session.text,
+            session_files={key: str(path) for key, path in named_files(session).items()},
             site=label,
             wall_offset_ns=time.time_ns() - SteadyClock().now_ns(),
             states={state.value: state.name for state in State},
