@@ -170,6 +170,17 @@ def test_a_killed_recorder_leaves_readable_files(sites: Sites, tmp_path: Path) -
     assert all(len(run.rows) > 100 and run.gaps == () for run in runs)
 
 
+def test_who_is_heard_again_is_told(
+    sites: Sites, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_command, "SILENT_S", 0.0)
+    wish = (DEMO, "--out", tmp_path / "out", "--duration", "2", "--connect", sites.endpoint)
+    result = record(*wish)
+    assert result.exit_code == 0
+    for site in ("local", "remote"):
+        assert f"{site}: heard again" in result.output
+
+
 def test_nothing_heard_is_told_and_no_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
