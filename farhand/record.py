@@ -45,8 +45,8 @@ def record(
         states = {state.value: state.name for state in State}
         named = {key: path.read_bytes() for key, path in named_files(loaded).items()}
         with (
-            StopSignals(SteadyClock(), duration) as signals,
             closing(Feed(loaded, connect)) as feed,
+            StopSignals(SteadyClock(), duration) as signals,
         ):
             _say(f"recording in {folder}")
             recorder = NetworkRecorder(folder, loaded.name, loaded.text, states, named)

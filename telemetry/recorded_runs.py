@@ -44,15 +44,11 @@ def recorded_runs(files: Iterable[Path]) -> list[Recording]:
 
 
 def _whole(segments: list[Recording]) -> Recording:
-    """Join segments in the order of their rows, and leave out what comes twice."""
-    run = joined(sorted(segments, key=_first_row))
-    if np.all(np.diff(run.rows["sequence"].astype(np.int64)) > 0) or len(segments) == 1:
+    """Join segments; of several, in the order of their rows and without what comes twice."""
+    run = joined(segments)
+    if len(segments) == 1 or np.all(np.diff(run.rows["sequence"].astype(np.int64)) > 0):
         return run
     _, rows = np.unique(run.rows["sequence"], return_index=True)
     _, arrivals = np.unique(run.arrivals["number"], return_index=True)
     events = sorted(dict.fromkeys(run.events), key=lambda event: event.stamp_ns)
     return replace(run, rows=run.rows[rows], events=tuple(events), arrivals=run.arrivals[arrivals])
-
-
-def _first_row(segment: Recording) -> int:
-    return int(segment.rows["sequence"][0]) if len(segment.rows) else -1
