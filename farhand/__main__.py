@@ -8,7 +8,11 @@ from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.export import export
 from farhand.info import info
+from farhand.plot import plot
+from farhand.record import record
+from farhand.replay import replay
 from farhand.reproduce import reproduce
 from farhand.simulate import simulate
 from local_site.daemon import local
@@ -27,7 +31,11 @@ for command in (
     dashboard,
     demo,
     simulate,
+    record,
     info,
+    replay,
+    plot,
+    export,
     certify,
     design,
     reproduce,

@@ -23,7 +23,7 @@ import numpy as np
 from telemetry.backlog import Backlog
 from telemetry.companion import input_ended, stand_back
 from telemetry.incidents import Incident, IncidentWatch
-from telemetry.piece import Piece
+from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import RecorderStatus, RowRing, SiteEvent
 from telemetry.rows import LAYOUT_VERSION, RowArray
@@ -74,6 +74,22 @@ class RecorderOptions:
         return cls(**values)
 
 
+def about_run(
+    session_name: str, digest: int, epoch: int, states: Mapping[int, str]
+) -> dict[str, str]:
+    """Return what a recording tells of its run, and of the programs here."""
+    return {
+        "session": session_name,
+        "digest": f"{digest:016x}",
+        "epoch": str(epoch),
+        "layout_version": str(LAYOUT_VERSION),
+        "states": json.dumps(states),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{name: version(name) for name in _PROGRAMS},
+    }
+
+
 class Recorder:
     """One thread drains the ring into a backlog, another writes the backlog to the disk."""
 
@@ -88,16 +104,7 @@ class Recorder:
             layout.dimension,
             options.wall_offset_ns,
             options.session_text,
-            {
-                "session": options.session_name,
-                "digest": f"{layout.digest:016x}",
-                "epoch": str(layout.epoch),
-                "layout_version": str(LAYOUT_VERSION),
-                "states": json.dumps(options.states),
-                "python": platform.python_version(),
-                "platform": platform.platform(),
-                **{name: version(name) for name in _PROGRAMS},
-            },
+            about_run(options.session_name, layout.digest, layout.epoch, options.states),
         )
         self._watch = IncidentWatch(
             {n: name for n, name in options.states.items() if name in options.incident_states}
@@ -147,8 +154,10 @@ class Recorder:
 
     def _arrivals_for(self, rows: RowArray) -> RowArray:
         """Take what arrived up to the last of these rows: it is there before the row is."""
+        if not len(rows):
+            return NO_ARRIVALS
         arrivals = self._ring.arrivals_from(self._next_arrival)
-        last = rows["sequence"][-1] if len(rows) else 0
+        last = rows["sequence"][-1]
         arrivals = arrivals[: np.searchsorted(arrivals["row"], last, side="right")]
         if len(arrivals):
             self._next_arrival = int(arrivals["number"][-1]) + 1
