@@ -387,6 +387,25 @@ def test_what_cannot_start_is_json_too(alone: Callable[..., Daemon]) -> None:
     assert not (daemon.err.parent / "state").exists()
 
 
+def test_metrics_need_no_recorder(alone: Callable[..., Daemon]) -> None:
+    daemon = alone("--no-record", "--metrics", "0", "--quiet")
+    until(lambda: daemon.scrape()["farhand_ticks_total"] > 10, daemon.said)
+    found = daemon.scrape()
+    assert found["farhand_recorder_recording"] == 0
+    assert found["farhand_state READY"] == 1
+    assert found["farhand_peer_state READY"] == 0
+    daemon.close()  # as the kernel would, without farewell: its metrics end with it
+    until(lambda: not served(daemon.url), lambda: "the end of the metrics")
+
+
+def served(url: str) -> bool:
+    try:
+        read(url)
+    except OSError:
+        return False
+    return True
+
+
 def test_nothing_is_served_unless_asked(alone: Callable[..., Daemon]) -> None:
     daemon = alone("--no-record")
     daemon.until_said("metered")
