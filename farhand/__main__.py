@@ -11,6 +11,7 @@ from farhand.devices import device_check, devices
 from farhand.export import export
 from farhand.info import info
 from farhand.plot import plot
+from farhand.recompute import recompute
 from farhand.record import record
 from farhand.replay import replay
 from farhand.reproduce import reproduce
@@ -34,6 +35,7 @@ for command in (
     record,
     info,
     replay,
+    recompute,
     plot,
     export,
     certify,

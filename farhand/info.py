@@ -1,7 +1,7 @@
 """`farhand info`: what a recording holds, at a glance."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -14,13 +14,15 @@ from rich.text import Text
 
 from farhand.console import OUT, user_errors
 from site_runtime.guard import Cut, cut_names
+from telemetry.latency import STAGES, sample_latencies, stage_percentiles_us
 from telemetry.recorded_runs import recorded_runs, recording_files
 from telemetry.recording import Recording
-from telemetry.rows import RowArray
+from telemetry.rows import REJECT_REASONS, RowArray
 
 FloatArray = npt.NDArray[np.float64]
 
 SHOWN = 10
+PERCENTS = (50, 99, 99.9)
 
 
 def info(
@@ -29,10 +31,16 @@ def info(
         typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders of them."),
     ],
 ) -> None:
-    """Tell what recordings hold: duration, states, gaps, events, loop age, lateness, packets."""
+    """Tell what recordings hold: duration, states, gaps, events, loop age, lateness, packets.
+
+    Of recordings of both sites, also where the time goes from one device to the other.
+    """
     with user_errors():
-        for run in recorded_runs(recording_files(paths)):
+        runs = recorded_runs(recording_files(paths))
+        for run in runs:
             OUT.print(_table(run))
+        for local, remote in _pairs(runs):
+            OUT.print(_latency_table(local, remote))
 
 
 def _table(run: Recording) -> Table:
@@ -61,13 +69,58 @@ def _table(run: Recording) -> Table:
     table.add_row("tick", f"{_percentiles(1e-3 * rows['duration_ns'])} µs of computing")
     counted = {name: int(rows[name][-1].sum()) for name in ("missed", "lost", "late", "rejected")}
     table.add_row("ticks", f"{counted['missed']} missed")
-    table.add_row(
-        "packets", ", ".join(f"{counted[name]} {name}" for name in ("lost", "late", "rejected"))
-    )
+    packets = ", ".join(f"{counted[name]} {name}" for name in ("lost", "late", "rejected"))
+    table.add_row("packets", packets + _reasons(rows))
     table.add_row("guard", _cuts(rows))
     table.add_row("events", _events(run, int(stamps_ns[0])))
     table.add_row("programs", f"farhand {metadata['farhand']}, Python {metadata['python']}")
     return table
+
+
+def _pairs(runs: Sequence[Recording]) -> Iterator[tuple[Recording, Recording]]:
+    """Pair local and remote runs of one session that overlap in time."""
+    for local in runs:
+        for remote in runs:
+            sites = (local.metadata["site"], remote.metadata["site"])
+            alike = local.metadata["digest"] == remote.metadata["digest"]
+            if sites != ("local", "remote") or not alike:
+                continue
+            start_ns = max(run.wall_times_ns[0] for run in (local, remote))
+            end_ns = min(run.wall_times_ns[-1] for run in (local, remote))
+            if start_ns < end_ns:
+                yield local, remote
+
+
+def _latency_table(local: Recording, remote: Recording) -> Table:
+    """Where the time goes, stage by stage, both ways."""
+    ways = {
+        "local → remote": sample_latencies(local.rows, remote.rows),
+        "remote → local": sample_latencies(remote.rows, local.rows),
+    }
+    table = Table(title="from one device to the other [µs]", title_justify="left")
+    table.add_column("stage")
+    for way in ways:
+        table.add_column(f"{way}  p50", justify="right")
+        for percent in PERCENTS[1:]:
+            table.add_column(f"p{percent:g}", justify="right")
+    columns = [stage_percentiles_us(found, PERCENTS) for found in ways.values()]
+    for stage in (*STAGES, "total"):
+        cells = [f"{value:.0f}" for column in columns for value in column[stage]]
+        table.add_row(stage, *cells, style="bold" if stage == "total" else None)
+    table.caption = "; ".join(
+        f"{way}: {len(found)} samples, network ± {np.median(found['uncertainty']) * 1e-3:.0f} µs"
+        for way, found in ways.items()
+        if len(found)
+    )
+    return table
+
+
+def _reasons(rows: RowArray) -> str:
+    counts = np.atleast_1d(rows["rejected"][-1])
+    if len(counts) != len(REJECT_REASONS) or not counts.any():
+        return ""
+    told = [f"{n} {reason}" for reason, n in zip(REJECT_REASONS, counts, strict=True) if n]
+    return f" ({', '.join(told)})"
 
 
 def _gaps(run: Recording) -> str:

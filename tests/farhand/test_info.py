@@ -1,6 +1,5 @@
 """`farhand info` on recordings of a simulated run."""
 
-import json
 import re
 from pathlib import Path
 
@@ -11,14 +10,12 @@ from typer.testing import CliRunner, Result
 from experiments.simulation import Simulation
 from farhand.__main__ import app
 from site_runtime.session import load_session
-from site_runtime.supervisor import State
-from telemetry.piece import Piece
-from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import RowArray
+from tests.fakes import recordings
+from tests.fakes.exchange import HOLD_TICKS, OFFSET_NS, exchange
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
-WALL_OFFSET_NS = 1_764_000_000_000_000_000  # the clock of the run was zero at 16:00:00 UTC
 
 
 def info(*arguments: Path) -> Result:
@@ -34,25 +31,11 @@ def rows() -> RowArray:
     return Simulation(load_session(DEMO)).run(1.0).local
 
 
-def record(folder: Path, name: str, rows: RowArray, epoch: str = "9", close: bool = True) -> Path:
-    states = json.dumps({str(state.value): state.name for state in State})
-    metadata = {
-        "session": "demo",
-        "epoch": epoch,
-        "states": states,
-        "farhand": "0.1.0",
-        "python": "3.11.7",
-    }
-    path = folder / f"rows-{name}-local.mcap"
-    writer = RecordingWriter(path, RecordingSource("local", 2, 2, WALL_OFFSET_NS, "", metadata))
+def record(folder: Path, name: str, rows: RowArray, epoch: int = 9, close: bool = True) -> Path:
     event = SiteEvent(int(rows["stamp_ns"][0]) + 5_000_000, "ENGAGED: both sites agree")
-    writer.write(Piece(rows, (event,)))
-    writer.flush()
-    if close:
-        writer.close()
-    else:
-        writer.abandon()
-    return path
+    path = folder / f"rows-{name}-local.mcap"
+    session = load_session(DEMO)
+    return recordings.record(path, "local", rows, session, epoch=epoch, events=[event], close=close)
 
 
 def test_a_run_is_told_with_its_figures(tmp_path: Path, rows: RowArray) -> None:
@@ -106,3 +89,23 @@ def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
     result = info(other)
     assert result.exit_code == 2
     assert "Traceback" not in result.output
+
+
+def test_of_both_sites_the_way_from_device_to_device_is_told_stage_by_stage(
+    tmp_path: Path,
+) -> None:
+    local, remote = exchange()
+    session, wall_ns = load_session(DEMO), recordings.WALL_OFFSET_NS
+    for site, rows, offset_ns in (("local", local, OFFSET_NS), ("remote", remote, 0)):
+        path = tmp_path / f"rows-a-{site}.mcap"
+        recordings.record(path, site, rows, session, wall_offset_ns=wall_ns + offset_ns)
+    told = words(info(tmp_path))
+    assert "local → remote: 200 samples, network ± 5 µs" in told
+    assert "network 1160" in told
+    assert f"hold {HOLD_TICKS * 1000}" in told
+    assert "remote → local:" not in told
+
+
+def test_refused_packets_are_told_by_reason(tmp_path: Path, rows: RowArray) -> None:
+    rows["rejected"][-1, 4], rows["rejected"][-1, 9] = 3, 1
+    assert "4 rejected (3 checksum, 1 duplicate)" in words(info(record(tmp_path, "a", rows)))
