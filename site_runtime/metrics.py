@@ -1,5 +1,6 @@
 """The Prometheus endpoint of a daemon: where it listens, and what it is told."""
 
+import re
 from dataclasses import dataclass
 
 import typer
@@ -13,6 +14,7 @@ from telemetry.metrics import MetricsOptions
 from telemetry.metrics_process import MetricsProcess
 
 LOOPBACK = "127.0.0.1"
+_ADDRESS = re.compile(r"(?:(?:\[(?P<v6>[^][]+)\]|(?P<host>[^][:]+)):)?(?P<port>[0-9]{1,5})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +26,11 @@ class MetricsAddress:
 
 
 def metrics_address(text: str) -> MetricsAddress:
-    """Read PORT or HOST:PORT; typer.BadParameter for anything else."""
-    host, colon, port = text.rpartition(":")
-    if not port.isascii() or not port.isdigit() or int(port) > 65535 or (colon and not host):
+    """Read PORT or HOST:PORT, an IPv6 host in brackets; typer.BadParameter for anything else."""
+    found = _ADDRESS.fullmatch(text)
+    if found is None or int(found["port"]) > 65535:
         raise typer.BadParameter(f"{text!r} is no port from 0 to 65535, nor HOST:PORT")
-    return MetricsAddress(host.strip("[]") or LOOPBACK, int(port))
+    return MetricsAddress(found["v6"] or found["host"] or LOOPBACK, int(found["port"]))
 
 
 def start_metrics(

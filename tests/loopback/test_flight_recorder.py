@@ -102,7 +102,11 @@ class Daemon:
         return pid
 
     def until_recording(self) -> None:
-        self.until(lambda: any(self.recordings.glob("rows-*.mcap")), "a recording")
+        """Until the recorder has told the site that it records: the file comes before that."""
+        self.until(
+            lambda: any(self.recordings.glob("rows-*.mcap")) and "recording in" in self.text(),
+            "a recording",
+        )
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         end_s = time.monotonic() + DEADLINE_S

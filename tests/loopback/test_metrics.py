@@ -161,31 +161,48 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[SiteId, Daem
             daemon.close()
 
 
+def implausible(
+    found: dict[str, float], more: dict[str, float], delay_s: float
+) -> dict[str, float]:
+    """What does not fit to a second of an engaged pair with this injected delay."""
+    ran = more["farhand_ticks_total"]
+    samples = more["farhand_hold_seconds_count"]
+    held_s, on_the_way_s, one_way_s = (
+        more[f"farhand_{name}_seconds_sum"] / max(more[f"farhand_{name}_seconds_count"], 1)
+        for name in ("hold", "network_delay", "one_way_delay")
+    )
+    judged = {
+        "rate": (ran + more["farhand_missed_ticks_total"], 400, 700),
+        "round trips": (more["farhand_round_trip_seconds_count"] / ran, 0.9, 1.0),
+        "delays": (more["farhand_one_way_delay_seconds_count"] / ran, 0.9, 1.0),
+        "samples": (samples / ran, 0.1, 1.0),
+        "held and on the way": (held_s + on_the_way_s, 0.9 * delay_s, 1.2 * one_way_s),
+        "margin": (found["farhand_margin_seconds"], -1.0, 0.3 - 0.08),
+        "force share": (found["farhand_force_share"], 0.01, 1.0),
+        "uncertainty": (found["farhand_clock_uncertainty_seconds"], 1e-9, 1.0),
+    }
+    return {name: value for name, (value, low, high) in judged.items() if not low <= value <= high}
+
+
 def test_a_scrape_tells_how_the_pair_runs(pair: dict[SiteId, Daemon]) -> None:
     for site, delay_s in ((LOCAL, 0.05), (REMOTE, 0.03)):
         daemon = pair[site]
-        before = daemon.scrape()
-        time.sleep(1.0)
-        found = daemon.scrape()
-        more = {name: value - before[name] for name, value in found.items()}
-        ran = more["farhand_ticks_total"]
-        assert ran + more["farhand_missed_ticks_total"] == pytest.approx(500, rel=0.5)
-        for counted in ("wakeup_lateness", "tick_duration"):
-            assert (counted, more[f"farhand_{counted}_seconds_count"]) == (counted, ran)
-        for counted in ("round_trip", "one_way_delay"):  # not known in each of the first ticks
-            assert 0.9 * ran <= more[f"farhand_{counted}_seconds_count"] <= ran
-        for stage in ("read", "step", "write", "send"):
-            assert 0 < more[f"farhand_stage_seconds_count {stage}"] <= ran
-            assert more[f"farhand_stage_seconds_sum {stage}"] > 0
-        samples = more["farhand_hold_seconds_count"]
-        assert 0 < samples <= ran
-        waited = more["farhand_hold_seconds_sum"] + more["farhand_network_delay_seconds_sum"]
-        one_way = more["farhand_one_way_delay_seconds_sum"] / ran
-        assert delay_s * 0.9 < waited / samples <= one_way + 0.001
+        for _ in range(8):  # a crowded machine may need more than one second
+            before = daemon.scrape()
+            time.sleep(1.0)
+            found = daemon.scrape()
+            more = {name: value - before[name] for name, value in found.items()}
+            ran = more["farhand_ticks_total"]
+            assert more["farhand_wakeup_lateness_seconds_count"] == ran
+            assert more["farhand_tick_duration_seconds_count"] == ran
+            for stage in ("read", "step", "write", "send"):
+                assert 0 < more[f"farhand_stage_seconds_count {stage}"] <= ran
+                assert more[f"farhand_stage_seconds_sum {stage}"] > 0
+            odd = implausible(found, more, delay_s)
+            if not odd:
+                break
+        assert odd == {}
         assert found["farhand_certified_round_trip_seconds"] == pytest.approx(0.3, abs=0.01)
-        assert found["farhand_margin_seconds"] < 0.3 - 0.08
-        assert found["farhand_force_share"] > 0
-        assert 0 < found["farhand_clock_uncertainty_seconds"] < 1
         assert found["farhand_packets_rejected_total session"] == 0
         assert found["farhand_recorder_recording"] == 1
         assert found["farhand_recorder_rows_written_total"] > 100
@@ -385,6 +402,25 @@ def test_what_cannot_start_is_json_too(alone: Callable[..., Daemon]) -> None:
     assert "in use" in last["text"]
     # it never recorded: no tick was made, nothing died
     assert not (daemon.err.parent / "state").exists()
+
+
+def test_metrics_need_no_recorder(alone: Callable[..., Daemon]) -> None:
+    daemon = alone("--no-record", "--metrics", "0", "--quiet")
+    until(lambda: daemon.scrape()["farhand_ticks_total"] > 10, daemon.said)
+    found = daemon.scrape()
+    assert found["farhand_recorder_recording"] == 0
+    assert found["farhand_state READY"] == 1
+    assert found["farhand_peer_state READY"] == 0
+    daemon.close()  # as the kernel would, without farewell: its metrics end with it
+    until(lambda: not served(daemon.url), lambda: "the end of the metrics")
+
+
+def served(url: str) -> bool:
+    try:
+        read(url)
+    except OSError:
+        return False
+    return True
 
 
 def test_nothing_is_served_unless_asked(alone: Callable[..., Daemon]) -> None:

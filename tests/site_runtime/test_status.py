@@ -10,9 +10,11 @@ from rich.console import Console
 from channel.channel import Counters
 from channel.packet import Reject
 from experiments.simulation import Simulation
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.guard import Cut
 from site_runtime.session import LoopSettings, load_session
 from site_runtime.site import Site
+from site_runtime.site_events import SiteEvents
 from site_runtime.status import StatusLine, describe, summary
 from site_runtime.supervisor import State
 
@@ -116,6 +118,16 @@ def test_a_site_that_is_not_watched_prints_nothing(
     assert capsys.readouterr().err == ""
 
 
+def test_events_are_told_to_the_last_without_a_live_line(
+    fresh: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    events = SiteEvents(fresh, (), DaemonLog("local"), 0)
+    with StatusLine(fresh, (), events, live=False):
+        fresh.telemetry.farewell(0)  # long before the next look
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["1970-01-01T00:00:00.000Z local  READY: farewell"]
+
+
 class TroubledRecorder:
     folder = "/state/[demo]/local"
     incidents = 2
@@ -131,6 +143,9 @@ def test_the_line_and_the_summary_say_what_the_recorder_could_not_do(fresh: Site
     text = console.file.getvalue()
     assert recorder.trouble in text
     assert "2 kept in /state/[demo]/local" in text
+    metrics: Any = TroubledRecorder()
+    metrics.trouble = "no metrics"
+    assert describe(fresh, 100.0, recorder, metrics).endswith(f"{recorder.trouble} · no metrics")
     recorder.trouble = None
     assert "record" not in describe(fresh, 100.0, recorder)
 
