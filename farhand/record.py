@@ -14,7 +14,7 @@ from farhand.feed import Feed
 from site_runtime.clock import SteadyClock
 from site_runtime.daemon import Connect, Duration, SessionPath, StopSignals
 from site_runtime.keys import SiteId
-from site_runtime.session import Session, load_session
+from site_runtime.session import Session, load_session, named_files
 from site_runtime.supervisor import State
 from telemetry.network_recorder import NetworkRecorder, Recorded
 from telemetry.recording import Gap
@@ -43,12 +43,13 @@ def record(
         loaded = load_session(session)
         folder = _folder(loaded, out, force)
         states = {state.value: state.name for state in State}
+        named = {key: path.read_bytes() for key, path in named_files(loaded).items()}
         with (
-            StopSignals(SteadyClock(), duration) as signals,
             closing(Feed(loaded, connect)) as feed,
+            StopSignals(SteadyClock(), duration) as signals,
         ):
             _say(f"recording in {folder}")
-            recorder = NetworkRecorder(folder, loaded.name, loaded.text, states)
+            recorder = NetworkRecorder(folder, loaded.name, loaded.text, states, named)
             try:
                 _record(feed, recorder, signals)
             finally:

@@ -36,8 +36,7 @@ def session_of(take: Take, recording: Path, original: Path | None) -> Session:
     """Return the session that was recorded: from its original file, or from the recording.
 
     Files that the text names are taken from the recording, or else looked for beside `recording`.
-    TelemetryError if it is
-    not to be had, or the original is another session.
+    TelemetryError if it is not to be had, or the original is another session.
     """
     digest = take.metadata["digest"]
     if original is not None:

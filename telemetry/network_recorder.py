@@ -49,7 +49,8 @@ class NetworkRecorder:
     """Writes the rows of every run of both sites into a folder, in segments of a minute.
 
     Rows that never came, or that there was no room for, are gaps: an event in the recording, and a
-    notice. `states` names the supervisor states by number.
+    notice. `states` names the supervisor states by number; `session_files` are what the session
+    names, by key.
     """
 
     def __init__(
@@ -58,10 +59,12 @@ class NetworkRecorder:
         session_name: str,
         session_text: str,
         states: Mapping[int, str],
+        session_files: Mapping[str, bytes],
         backlog_bytes: int = BACKLOG_BYTES,
     ) -> None:
         self._folder = folder
         self._session_text = session_text
+        self._session_files = session_files
         self._session_name = session_name
         self._states = states
         self._backlog_bytes = backlog_bytes
@@ -109,6 +112,7 @@ class NetworkRecorder:
             self._session_text,
             about_run(self._session_name, batch.digest, batch.epoch, self._states)
             | {"source": "network"},
+            self._session_files,
         )
 
     def _write(self) -> None:

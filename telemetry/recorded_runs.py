@@ -1,7 +1,10 @@
 """The runs that recordings on a disk hold: files and folders in, one recording a run out."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from telemetry.recording import Recording, joined, read_recording
 from telemetry.rows import TelemetryError
@@ -24,8 +27,8 @@ def recording_files(paths: Iterable[Path]) -> list[Path]:
 def recorded_runs(files: Iterable[Path]) -> list[Recording]:
     """Join the segments of each run of each site, in the order of their first rows.
 
-    A run without rows is left out. TelemetryError if a file is no recording, or two are by
-    different recorders of one run.
+    A run without rows is left out; what several files hold, as an incident's, comes once.
+    TelemetryError if a file is no recording, or two are by different recorders of one run.
     """
     segments: dict[tuple[str, str], list[Recording]] = {}
     for file in files:
@@ -36,9 +39,16 @@ def recorded_runs(files: Iterable[Path]) -> list[Recording]:
                     f"{file} is a second recording of a run: give those of one recorder"
                 )
             run.append(recording)
-    runs = [joined(sorted(run, key=_first_row)) for run in segments.values()]
+    runs = [_whole(run) for run in segments.values()]
     return sorted((run for run in runs if len(run.rows)), key=lambda run: int(run.wall_times_ns[0]))
 
 
-def _first_row(segment: Recording) -> int:
-    return int(segment.rows["sequence"][0]) if len(segment.rows) else -1
+def _whole(segments: list[Recording]) -> Recording:
+    """Join segments; of several, in the order of their rows and without what comes twice."""
+    run = joined(segments)
+    if len(segments) == 1 or np.all(np.diff(run.rows["sequence"].astype(np.int64)) > 0):
+        return run
+    _, rows = np.unique(run.rows["sequence"], return_index=True)
+    _, arrivals = np.unique(run.arrivals["number"], return_index=True)
+    events = sorted(dict.fromkeys(run.events), key=lambda event: event.stamp_ns)
+    return replace(run, rows=run.rows[rows], events=tuple(events), arrivals=run.arrivals[arrivals])

@@ -27,6 +27,7 @@ def traces() -> list[SiteTrace]:
     run = Simulation(load_session(DEMO)).run(1.0)
     local = np.concatenate((run.local[:400], run.local[600:]))
     local["state"][500:600] = State.HOLD
+    local["offset_m"][:, 0] = 0.02
     for rows, late_us in ((local, 60), (run.remote, 90)):
         rows["lateness_ns"] = 1000 * late_us
     return [trace_of("local", local), trace_of("remote", run.remote)]

@@ -170,6 +170,17 @@ def test_a_killed_recorder_leaves_readable_files(sites: Sites, tmp_path: Path) -
     assert all(len(run.rows) > 100 and run.gaps == () for run in runs)
 
 
+def test_who_is_heard_again_is_told(
+    sites: Sites, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_command, "SILENT_S", 0.0)
+    wish = (DEMO, "--out", tmp_path / "out", "--duration", "2", "--connect", sites.endpoint)
+    result = record(*wish)
+    assert result.exit_code == 0
+    for site in ("local", "remote"):
+        assert f"{site}: heard again" in result.output
+
+
 def test_nothing_heard_is_told_and_no_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,6 +193,19 @@ def test_nothing_heard_is_told_and_no_success(
     assert "nothing was recorded" in result.output
     for site in ("local", "remote"):
         assert result.output.count(f"{site}: nothing heard for 0.2 s") == 1
+
+
+def test_silence_and_its_end_are_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record_command, "SILENT_S", 0.2)
+    hearing = record_command._Hearing()
+    assert hearing.changes() == []
+    time.sleep(0.3)
+    hearing.heard(SiteId.LOCAL)
+    assert hearing.changes() == ["remote: nothing heard for 0.2 s"]
+    assert hearing.changes() == []
+    hearing.heard(SiteId.REMOTE)
+    hearing.heard(SiteId.REMOTE)
+    assert hearing.changes() == ["remote: heard again"]
 
 
 def test_a_folder_that_holds_recordings_is_added_to_only_by_force(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from matplotlib.image import imread
 from rerun.chunk import RrdReader
 from typer.testing import CliRunner, Result
 
-from experiments.simulation import Run
+from experiments.simulation import Run, Simulation
 from farhand import replay
 from farhand.__main__ import app
 from site_runtime.session import Session, load_session
@@ -31,6 +31,7 @@ from telemetry.result_file import column_names, read_result
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import COLUMNS, RowArray
 from telemetry.stream import Batch
+from tests.fakes import recordings
 from tests.fakes.recordings import WALL_OFFSET_NS, record
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
@@ -101,6 +102,8 @@ def test_parquet_has_a_table_a_site_with_every_row_and_what_explains_it(
     assert json.loads(gaps) == [missing(demo_run)]
     [event] = pq.read_table(out / "events.parquet").to_pylist()
     assert (event["site"], event["text"]) == ("local", EVENTS[0].text)
+    first = demo_run.local[0]
+    assert event["time_s"] == (EVENTS[0].stamp_ns - first["stamp_ns"] + first["time_ns"]) * 1e-9
     assert (out / "session.toml").read_text(encoding="utf-8") == demo_session.text
 
 
@@ -251,35 +254,42 @@ def test_a_file_and_a_folder_are_not_taken_for_each_other(folder: Path, tmp_path
 
 
 @pytest.fixture(scope="module")
-def seven_dof(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording whose session names a URDF that is not beside it."""
-    from experiments.simulation import Simulation
-
+def seven_dof_run() -> tuple[Session, RowArray]:
+    """A session that names a URDF."""
     session = load_session(SEVEN_DOF)
-    path = tmp_path_factory.mktemp("seven") / "rows-a-local.mcap"
-    return record(path, "local", Simulation(session).run(0.4).local, session)
+    return session, Simulation(session).run(0.4).local
 
 
-def test_a_urdf_is_found_beside_the_recording_or_through_the_original(
-    seven_dof: Path, tmp_path: Path
+def to_rrd(recording: Path, *more: str | Path) -> Result:
+    out = recording.with_suffix(".rrd")
+    return farhand("export", recording, "--to", "rrd", "--out", out, "--force", *more)
+
+
+def test_a_recording_holds_the_urdf_that_its_session_names(
+    seven_dof_run: tuple[Session, RowArray], tmp_path: Path
 ) -> None:
-    def exported(recording: Path, *more: str | Path) -> Result:
-        wish = ("--to", "rrd", "--out", tmp_path / "a.rrd", "--force")
-        return farhand("export", recording, *wish, *more)
+    session, rows = seven_dof_run
+    result = to_rrd(record(tmp_path / "rows-a-local.mcap", "local", rows, session))
+    assert result.exit_code == 0
+    assert "may differ" not in result.output
 
-    alone = exported(seven_dof)
+
+def test_a_urdf_that_is_not_in_it_is_found_beside_or_through_the_original(
+    seven_dof_run: tuple[Session, RowArray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, rows = seven_dof_run
+    monkeypatch.setattr(recordings, "named_files", lambda _: {})
+    path = record(tmp_path / "rows-a-local.mcap", "local", rows, session)
+    alone = to_rrd(path)
     assert alone.exit_code == 2
     assert "seven_dof_arm.urdf" in alone.output
     assert "--session" in alone.output
-    assert exported(seven_dof, "--session", SEVEN_DOF).exit_code == 0
-    beside = tmp_path / "beside" / "rows-a-local.mcap"
-    beside.parent.mkdir()
-    beside.write_bytes(seven_dof.read_bytes())
+    assert to_rrd(path, "--session", SEVEN_DOF).exit_code == 0
     urdf = SEVEN_DOF.with_name("seven_dof_arm.urdf").read_text(encoding="utf-8")
-    (beside.parent / "seven_dof_arm.urdf").write_text(urdf, encoding="utf-8")
-    assert exported(beside).exit_code == 0
-    (beside.parent / "seven_dof_arm.urdf").write_text(urdf + "\n", encoding="utf-8")
-    changed = exported(beside)
+    (tmp_path / "seven_dof_arm.urdf").write_text(urdf, encoding="utf-8")
+    assert to_rrd(path).exit_code == 0
+    (tmp_path / "seven_dof_arm.urdf").write_text(urdf + "\n", encoding="utf-8")
+    changed = to_rrd(path)
     assert changed.exit_code == 0
     assert "may differ" in changed.output
 
@@ -343,16 +353,20 @@ def board(monkeypatch: pytest.MonkeyPatch) -> Board:
     return board
 
 
-@pytest.mark.parametrize(("speed", "least_s"), [("2", 0.9), ("4", 0.45)])
-def test_a_replay_takes_its_time(folder: Path, board: Board, speed: str, least_s: float) -> None:
-    assert farhand("replay", folder, "--speed", speed, "--quit").exit_code == 0
+@pytest.mark.parametrize(("speed", "start", "least_s"), [("2", "0", 0.9), ("0.2", "1.7", 1.2)])
+def test_a_replay_takes_its_time(
+    folder: Path, board: Board, speed: str, start: str, least_s: float
+) -> None:
+    result = farhand("replay", folder, "--speed", speed, "--start", start, "--quit")
+    assert result.exit_code == 0
     offered_s = [at for at, _, _ in board.offered]
     assert least_s < offered_s[-1] - offered_s[0] < least_s + 5.0
     arrivals_ns = [arrival_ns for _, _, arrival_ns in board.offered]
     assert arrivals_ns == sorted(arrivals_ns)
-    began_s = offered_s[0] - arrivals_ns[0] * 1e-9 / float(speed)
-    for at_s, _, arrival_ns in board.offered:
-        assert at_s >= began_s + arrival_ns * 1e-9 / float(speed) - 0.001
+    for at_s, batch, arrival_ns in board.offered:
+        assert arrival_ns == batch.rows["time_ns"][-1] + 2 * MS * batch.site
+        since_s = (arrival_ns - arrivals_ns[0]) * 1e-9 / float(speed)
+        assert at_s - offered_s[0] >= since_s - 0.05
 
 
 def test_a_replay_starts_where_it_is_told_to(folder: Path, board: Board) -> None:

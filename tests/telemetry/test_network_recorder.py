@@ -20,6 +20,7 @@ from telemetry.rows import RowArray
 from telemetry.stream import Batch
 
 STATES = {0: "OFFLINE", 3: "ENGAGED"}
+FILES = {"remote.robot.path": b"<robot/>"}
 DIGEST = 2**63 + 7
 DEADLINE_S = 30.0
 MS = 1_000_000
@@ -34,7 +35,7 @@ def batches(rows: RowArray, site: int = 0, epoch: int = 1, size: int = 50) -> li
 
 
 def recorder_in(folder: Path, backlog_bytes: int = 2**26) -> NetworkRecorder:
-    return NetworkRecorder(folder, "demo", "format = 1\n", STATES, backlog_bytes)
+    return NetworkRecorder(folder, "demo", "format = 1\n", STATES, FILES, backlog_bytes)
 
 
 def offer(recorder: NetworkRecorder, several: Iterable[Batch]) -> None:
@@ -70,6 +71,7 @@ def test_both_sites_are_recorded_bit_by_bit_with_what_is_known_of_them(tmp_path:
         assert runs[site].rows.tobytes() == rows.tobytes()
         assert runs[site].complete
         assert runs[site].session_text == "format = 1\n"
+        assert runs[site].session_files == FILES
         told_of = runs[site].metadata
         assert told_of["source"] == "network"
         assert told_of["session"] == "demo"
@@ -83,6 +85,8 @@ def test_wall_times_are_this_machine_s_by_the_fastest_batches(tmp_path: Path, ru
     began_ns = time.time_ns()
     now_ns = time.monotonic_ns()
     for number, batch in enumerate(batches(run.remote[:500], 1)):
+        if number == 2:
+            time.sleep(0.3)  # the writer must not settle for the first, which were slow
         jitter_ns = 0 if number == 3 else 40 * MS
         newest_ns = int(batch.rows["time_ns"][-1])
         recorder.offer(batch, now_ns + newest_ns + 5 * MS + jitter_ns)
@@ -196,7 +200,7 @@ import numpy as np
 from telemetry.network_recorder import NetworkRecorder
 from telemetry.stream import Batch
 rows = np.load(sys.argv[2])
-recorder = NetworkRecorder(Path(sys.argv[1]), "demo", "", {})
+recorder = NetworkRecorder(Path(sys.argv[1]), "demo", "", {}, {})
 for first in range(0, len(rows), 50):
     recorder.offer(Batch(0, 2, 2, 1, 1, rows[first : first + 50]), time.monotonic_ns())
     print(first, flush=True)

@@ -47,6 +47,7 @@ def test_a_blocked_consumer_loses_the_oldest_and_the_producer_goes_on() -> None:
     for item in range(1000):
         pump.offer(item)
     assert pump.dropped == 990
+    assert pump.waiting == 10
     assert not pump.close(0.0)
     release.set()
     assert pump.close(DEADLINE_S)

@@ -8,6 +8,7 @@ import pytest
 
 from site_runtime.session import Session, load_session
 from telemetry import takes
+from telemetry.row_ring import ARRIVAL, SiteEvent
 from telemetry.rows import RowArray, TelemetryError
 from telemetry.takes import describe, joined_rows, read_take
 from tests.fakes.recordings import WALL_OFFSET_NS, record
@@ -135,6 +136,35 @@ def test_segments_are_joined_in_whatever_order_they_are_named(write: Writer, run
     [joined] = read_take([second, first]).runs
     assert joined.rows["sequence"].tolist() == [*range(100), *range(110, 200)]
     assert [(gap.first, gap.rows) for gap in joined.gaps] == [(100, 10)]
+
+
+def test_an_incident_beside_its_run_adds_nothing(write: Writer, run, session: Session) -> None:
+    said = (SiteEvent(1, "READY"), SiteEvent(2, "FAULT"))
+    came = np.zeros(5, ARRIVAL)
+    came["number"] = np.arange(5)
+    for name, rows, events, arrivals in (
+        ("rows-a-local", run.local[:200], said, came),
+        ("incident-a-local-fault", run.local[80:150], said[1:], came[2:4]),
+    ):
+        path = write.folder / f"{name}.mcap"
+        record(path, "local", rows, session, events=events, arrivals=arrivals)
+    [whole] = read_take(sorted(write.folder.iterdir())).runs
+    assert whole.rows.tobytes() == run.local[:200].tobytes()
+    assert whole.gaps == ()
+    assert whole.events == said
+    assert whole.arrivals["number"].tolist() == [0, 1, 2, 3, 4]
+    [incident] = read_take([write.folder / "incident-a-local-fault.mcap"]).runs
+    assert len(incident.rows) == 70
+
+
+def test_two_recordings_of_one_run_are_not_put_together(
+    write: Writer, run, session: Session
+) -> None:
+    write("a", "local", run.local[:100])
+    path = write.folder / "rows-b-local.mcap"
+    record(path, "local", run.local[:100], session, source="network")
+    with pytest.raises(TelemetryError, match="second recording of a run"):
+        read_take([write.folder])
 
 
 def test_recordings_of_different_sessions_are_told_by_name(
