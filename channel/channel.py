@@ -22,13 +22,15 @@ _MISMATCH_SHOWN_NS = 1_000_000_000  # for people: long enough to be read, short 
 class PeerSample:
     """The peer's sample in use at a tick; vectors (z,) in base axes, read-only.
 
-    `stamp_ns` is on the peer's clock. `age_ns` is how old the sample is, by the clock offset
-    estimate. `round_trip_ns` is the age of the whole loop on my clock alone: now minus my own stamp
-    that the peer was using when it sent this; injected delay, network, packet spacing and hold are
-    all in it. It is None while the peer was using no sample of mine.
+    `stamp_ns` is on the peer's clock, `arrival_ns`, when it came, on mine. `age_ns` is how old the
+    sample is, by the clock offset estimate. `round_trip_ns` is the age of the whole loop on my
+    clock alone: now minus my own stamp that the peer was using when it sent this; injected delay,
+    network, packet spacing and hold are all in it. It is None while the peer was using no sample of
+    mine.
     """
 
     stamp_ns: int
+    arrival_ns: int
     sequence: int
     position_m: FloatArray
     velocity_m_s: FloatArray
@@ -128,17 +130,19 @@ class Channel:
         offset_ns = 0 if self._shared_clock else self._clock_offset.offset_ns
         if offset_ns is None:
             return None
-        packet = self._injection.choose(now_ns, offset_ns)
+        chosen = self._injection.choose(now_ns, offset_ns)
         self.counters.late = self._injection.late
         self.counters.overtaken = self._injection.overtaken
-        if packet is None:
+        if chosen is None:
             self._used_stamp_ns = NO_STAMP
             return None
+        packet = chosen.packet
         self._used_stamp_ns = packet.stamp_ns
         self._greatest_age.add(now_ns, now_ns - packet.stamp_ns)
         answered = packet.echo_epoch == self._epoch and packet.used_stamp_ns != NO_STAMP
         return PeerSample(
             packet.stamp_ns,
+            chosen.arrival_ns,
             packet.sequence,
             packet.position_m,
             packet.velocity_m_s,

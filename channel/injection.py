@@ -6,7 +6,7 @@ Seeded: the same packets at the same ticks give the same choices.
 
 import bisect
 import heapq
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,6 +19,13 @@ _LOSS, _REORDERING, _DUPLICATION, _DELAY = range(4)
 _SLACK_NS = 1_000_000_000  # kept beyond the delay's bound, for an offset estimate that improves
 _PRUNE_AT = 256  # packets past use before the list is cut: cutting moves all that stay
 _FASTEST_HZ = 4000  # a peer sending faster loses the oldest of its history
+
+
+class Arrival(NamedTuple):
+    """A packet and when it arrived [my clock]."""
+
+    packet: Packet
+    arrival_ns: int
 
 
 class Injection:
@@ -65,10 +72,10 @@ class Injection:
 
     def clear(self) -> None:
         """Forget all packets: the peer restarted, and these are on another clock."""
-        self._held: list[tuple[int, int, Packet]] = []  # heap by (release, sequence)
+        self._held: list[tuple[int, int, Arrival]] = []  # heap by (release, sequence)
         self._stamps: list[int] = []  # exact: the released, sorted by stamp
-        self._packets: list[Packet] = []
-        self._newest: Packet | None = None
+        self._arrivals: list[Arrival] = []
+        self._newest: Arrival | None = None
         self._newest_target_ns: int | None = None
 
     def copies(self) -> int:
@@ -97,13 +104,14 @@ class Injection:
         if reordering is not None and self._reordering_rng.random() < reordering.probability:
             release_ns += round(reordering.extra_s * 1e9)
         if release_ns <= arrival_ns and not self._held:  # what is held may be due before it
-            self._release(packet)
+            self._release(Arrival(packet, arrival_ns))
         else:
-            heapq.heappush(self._held, (release_ns, packet.sequence, packet))
+            arrival = Arrival(packet, arrival_ns)
+            heapq.heappush(self._held, (release_ns, packet.sequence, arrival))
             if len(self._held) > self._capacity:  # too early rather than without end
                 self._release(heapq.heappop(self._held)[2])
 
-    def choose(self, now_ns: int, offset_ns: int) -> Packet | None:
+    def choose(self, now_ns: int, offset_ns: int) -> Arrival | None:
         """Return the packet to use at `now_ns`; None if none is due yet.
 
         A stamp of the peer's plus `offset_ns` is on my clock.
@@ -118,28 +126,29 @@ class Injection:
         if self._newest_target_ns is None or target_ns > self._newest_target_ns:
             self._newest_target_ns = target_ns
         chosen = bisect.bisect_right(stamps, target_ns) - 1
-        packet = self._packets[chosen] if chosen >= 0 else None
+        arrival = self._arrivals[chosen] if chosen >= 0 else None
         self._prune(now_ns - self._keep_ns - offset_ns)
-        return packet
+        return arrival
 
     def _delay_ns(self, time_ns: int) -> int:
         time_s = (time_ns - self._start_ns) * 1e-9
         return round(self._delay.at(time_s, self._delay_rng) * 1e9)
 
-    def _release(self, packet: Packet) -> None:
-        overtaken = self._newest is not None and packet.stamp_ns < self._newest.stamp_ns
+    def _release(self, arrival: Arrival) -> None:
+        stamp_ns = arrival.packet.stamp_ns
+        overtaken = self._newest is not None and stamp_ns < self._newest.packet.stamp_ns
         if overtaken:
             self.overtaken += 1
         else:
-            self._newest = packet
+            self._newest = arrival
         if self._mode != "exact":
             return
         # at an earlier tick this packet was already due
-        if self._newest_target_ns is not None and packet.stamp_ns <= self._newest_target_ns:
+        if self._newest_target_ns is not None and stamp_ns <= self._newest_target_ns:
             self.late += 1
-        place = bisect.bisect_right(self._stamps, packet.stamp_ns)
-        self._stamps.insert(place, packet.stamp_ns)
-        self._packets.insert(place, packet)
+        place = bisect.bisect_right(self._stamps, stamp_ns)
+        self._stamps.insert(place, stamp_ns)
+        self._arrivals.insert(place, arrival)
 
     def _prune(self, horizon_ns: int) -> None:
         stamps = self._stamps
@@ -150,4 +159,4 @@ class Injection:
         excess = max(past, len(stamps) - self._capacity)
         if excess >= _PRUNE_AT:
             del stamps[:excess]
-            del self._packets[:excess]
+            del self._arrivals[:excess]

@@ -78,7 +78,7 @@ def _table(run: Recording) -> Table:
     table.add_row("round trip", f"{_percentiles(1e3 * rows['round_trip_s'])} ms")
     table.add_row("lateness", f"{_percentiles(1e-3 * rows['lateness_ns'])} µs")
     table.add_row("tick", f"{_percentiles(1e-3 * rows['duration_ns'])} µs of computing")
-    counted = {name: int(rows[name][-1]) for name in ("missed", "lost", "late", "rejected")}
+    counted = {name: int(rows[name][-1].sum()) for name in ("missed", "lost", "late", "rejected")}
     table.add_row("ticks", f"{counted['missed']} missed")
     table.add_row(
         "packets", ", ".join(f"{counted[name]} {name}" for name in ("lost", "late", "rejected"))

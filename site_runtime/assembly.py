@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 from channel.channel import Channel
-from channel.link import Link
+from channel.link import Link, TappedLink
 from hardware.interface import ContactForce, Device, DeviceConfigurationError
 from hardware.registry import DeviceContext, driver, force_sensor
 from hardware.sensed import SensedDevice
@@ -89,12 +89,21 @@ def assemble(
     n, z = robot.joints, robot.task_dimension
     context = DeviceContext(robot, contact, clock.now_ns, start_ns, 2 * session.seed + identity)
     device = device_of(own, context)
+    telemetry = TelemetryStream(
+        n,
+        z,
+        identity,
+        session.digest,
+        surroundings.epoch,
+        surroundings.publish,
+        allocate=surroundings.allocate,
+    )
     return Site(
         identity,
         device=device,
         robot=robot,
         channel=Channel(
-            surroundings.link,
+            TappedLink(surroundings.link, telemetry.arrived),
             site=identity,
             session_digest=session.digest,
             epoch=surroundings.epoch,
@@ -111,15 +120,7 @@ def assemble(
         supervisor=Supervisor(engagement_rules(session, identity, start_ns), z),
         margin=margin_of(session),
         guard=Guard(limits_of(own.limits, robot, device.joint_stops), session.period_ns * 1e-9),
-        telemetry=TelemetryStream(
-            n,
-            z,
-            identity,
-            session.digest,
-            surroundings.epoch,
-            surroundings.publish,
-            allocate=surroundings.allocate,
-        ),
+        telemetry=telemetry,
         clock=clock,
         times=SiteTimes(
             session.period_ns,

@@ -1,5 +1,8 @@
 """What a site's own operator asks of it: keys and signals set it, ticks read it."""
 
+CLUTCH_BUTTON, CLUTCH, EMERGENCY_STOP, RESET = 1, 2, 4, 8
+"""Bits of what is asked for in one tick; the first by the device itself."""
+
 
 class OperatorRequests:
     """Clutch, emergency stop, reset. Any thread or signal handler may set them; none waits."""
@@ -22,16 +25,20 @@ class OperatorRequests:
         """Ask to leave FAULT or EMERGENCY_STOP."""
         self._reset = True
 
-    def take_emergency_stop(self) -> bool:
-        """Whether it was asked for since the last call."""
-        if not self._emergency_stop:
-            return False
-        self._emergency_stop = False  # after the look: one asked for in between is not lost
-        return True
+    def take(self) -> int:
+        """Return the clutch, and what else was asked for since the last call, as bits."""
+        asked = CLUTCH if self.clutch else 0
+        # cleared after the look: what is asked for in between is not lost
+        if self._emergency_stop:
+            self._emergency_stop = False
+            asked |= EMERGENCY_STOP
+        if self._reset:
+            self._reset = False
+            asked |= RESET
+        return asked
 
-    def take_reset(self) -> bool:
-        """Whether it was asked for since the last call."""
-        if not self._reset:
-            return False
-        self._reset = False
-        return True
+    def ask(self, bits: int) -> None:
+        """Ask for what these bits, of an earlier `take`, say."""
+        self.clutch = bool(bits & CLUTCH)
+        self._emergency_stop = bool(bits & EMERGENCY_STOP)
+        self._reset = bool(bits & RESET)

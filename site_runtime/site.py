@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from channel.channel import Channel, PeerSample
+from channel.packet import Reject
 from control_law.null_space import manipulability
 from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
 from hardware.interface import Device, DeviceState
@@ -18,13 +19,22 @@ from site_runtime.controller import Command, Controller
 from site_runtime.guard import Guard
 from site_runtime.keys import SiteId
 from site_runtime.margin import Margin
-from site_runtime.operator_requests import OperatorRequests
+from site_runtime.operator_requests import (
+    CLUTCH,
+    CLUTCH_BUTTON,
+    EMERGENCY_STOP,
+    RESET,
+    OperatorRequests,
+)
 from site_runtime.supervisor import DRIVEN, STOPPED, Cause, State, Supervisor
 from telemetry.rows import NO_PEER_STATE
 from telemetry.stream import TelemetryStream
 
 FloatArray = npt.NDArray[np.float64]
 _FAREWELL_PACKETS = 5
+_READ, _STEP, _WRITE, _SENT = range(4)
+_NO_STAGES = (0, 0, 0, 0)
+_MOST_COUNTED = 2**32 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +103,9 @@ class Site:
         self._late_ticks = 0
         self._derated = False
         self._told_m = np.zeros(robot.task_dimension)
+        self._stages_ns = [0, 0, 0, 0]
+        self._rejected = [0] * len(Reject)
+        self._rejected_total = 0
 
     @property
     def state(self) -> State:
@@ -135,16 +148,20 @@ class Site:
     def tick(self, lateness_ns: int = 0) -> None:
         """One tick. Whatever goes wrong ends in the device's stop, which never raises."""
         now_ns = self._clock.now_ns()
+        asked = self.requests.take()
         if self._supervisor.state in STOPPED:
-            self._tick_stopped(now_ns, lateness_ns)
+            self._tick_stopped(now_ns, lateness_ns, asked)
             return
-        self.requests.take_reset()  # asked for too early: it must not undo a stop to come
+        reading: DeviceState | None = None
+        self._stages_ns[:] = _NO_STAGES
         try:
             reading = self._device.read()
+            self._passed(_READ, now_ns)
+            asked |= CLUTCH_BUTTON if reading.clutch else 0
             self.guard.reading(reading)
             peer = self.channel.latest(now_ns)
             terms = self._robot.terms(reading.position_rad, reading.velocity_rad_s)
-            state = self._supervise(now_ns, lateness_ns, peer, terms, reading.clutch)
+            state = self._supervise(now_ns, lateness_ns, peer, terms, asked)
             command, torque_nm, share = self._idle, None, 0.0
             if state in DRIVEN and self._supervisor.target_m is not None:
                 target_m = self.guard.target(self._supervisor.target_m)
@@ -152,13 +169,17 @@ class Site:
                 engaged_s = self._supervisor.engaged_s(now_ns)
                 command = self._controller.step(terms, target_m, share, engaged_s)
                 torque_nm = self.guard.torque(command.torque_nm, terms)
+                self._passed(_STEP, now_ns)
                 self._device.write(torque_nm)
+                self._passed(_WRITE, now_ns)
             force_n = reading.wrench[: self._robot.task_dimension]
             self._told_m = self._supervisor.told_m(terms.X)
-            self.channel.send(now_ns, state, self._told_m, terms.X_dot, force_n)
-            self._put(now_ns, lateness_ns, reading, peer, terms, command, torque_nm, share)
+            if self.channel.send(now_ns, state, self._told_m, terms.X_dot, force_n):
+                self._passed(_SENT, now_ns)
+            self._put(now_ns, lateness_ns, asked, reading, peer, terms, command, torque_nm, share)
         except Exception as failure:
             self._fail(now_ns, failure)
+            self._put_failed(now_ns, lateness_ns, asked, reading)
         self.ticks += 1
         self._duration_ns = self._clock.now_ns() - now_ns
 
@@ -179,7 +200,7 @@ class Site:
         lateness_ns: int,
         peer: PeerSample | None,
         terms: RobotTerms,
-        clutch_button: bool,
+        asked: int,
     ) -> State:
         """Update the supervisor; switch the outputs on and off with its state."""
         times, supervisor, before = self._times, self._supervisor, self._supervisor.state
@@ -193,8 +214,8 @@ class Site:
             terms.X,
             scale=self.margin.share(self.channel.loop_bound_ns),
             late=self._late_ticks >= times.late_ticks_to_hold,
-            clutch=clutch_button or self.requests.clutch,
-            emergency_stop=self.requests.take_emergency_stop(),
+            clutch=bool(asked & (CLUTCH_BUTTON | CLUTCH)),
+            emergency_stop=bool(asked & EMERGENCY_STOP),
         )
         if state is not before:
             if state in DRIVEN and before not in DRIVEN:
@@ -213,7 +234,10 @@ class Site:
             )
         return state
 
-    def _tick_stopped(self, now_ns: int, lateness_ns: int) -> None:
+    def _passed(self, stage: int, start_ns: int) -> None:
+        self._stages_ns[stage] = self._clock.now_ns() - start_ns
+
+    def _tick_stopped(self, now_ns: int, lateness_ns: int, asked: int) -> None:
         """Tell the peer and people that the device is stopped, and wait for a reset."""
         with suppress(Exception):  # the link may be what failed; the first failure is the one told
             self.channel.latest(now_ns)
@@ -223,10 +247,10 @@ class Site:
             time_ns=now_ns - self._times.session_start_ns,
             lateness_ns=lateness_ns,
             state=self._supervisor.state,
+            requests=asked,
         )
         self.ticks += 1
-        self.requests.take_emergency_stop()  # it is stopped already
-        if self.requests.take_reset():
+        if asked & RESET:
             self._reset(now_ns)
 
     def _reset(self, now_ns: int) -> None:
@@ -257,6 +281,7 @@ class Site:
         self,
         now_ns: int,
         lateness_ns: int,
+        asked: int,
         reading: DeviceState,
         peer: PeerSample | None,
         terms: RobotTerms,
@@ -271,11 +296,19 @@ class Site:
         if target_m is not None:
             self.error_m = dist(terms.X, target_m)
         counters = self.channel.counters
+        self._count_rejected()
+        offset = self.channel.offset
+        read_ns, step_ns, write_ns, sent_ns = self._stages_ns
         self.telemetry.put(
             stamp_ns=now_ns,
             time_ns=now_ns - self._times.session_start_ns,
             lateness_ns=lateness_ns,
             duration_ns=self._duration_ns,
+            read_ns=read_ns,
+            step_ns=step_ns,
+            write_ns=write_ns,
+            sent_ns=sent_ns,
+            requests=asked,
             state=self._supervisor.state,
             peer_state=NO_PEER_STATE if peer is None else peer.state,
             cut=self.guard.cut,
@@ -289,6 +322,10 @@ class Site:
             peer_position_m=nan if target_m is None else target_m,
             offset_m=self._supervisor.offset_m,
             force_share=share,
+            used_stamp_ns=0 if peer is None else peer.stamp_ns,
+            used_arrival_ns=0 if peer is None else peer.arrival_ns,
+            clock_offset_ns=0 if offset is None else offset.offset_ns,
+            clock_uncertainty_ns=-1 if offset is None else offset.uncertainty_ns,
             one_way_delay_s=nan if peer is None else peer.age_ns * 1e-9,
             round_trip_s=self.round_trip_s,
             loop_bound_s=self.margin.loop_s,
@@ -299,9 +336,38 @@ class Site:
             sub_task_error_rad_s=command.sub_task_error_rad_s,
             lost=counters.lost,
             late=counters.late,
-            rejected=counters.rejected.total(),
+            rejected=self._rejected,
             missed=self.missed,
         )
+
+    def _put_failed(
+        self, now_ns: int, lateness_ns: int, asked: int, reading: DeviceState | None
+    ) -> None:
+        """Write the row of a tick that did not come to its end, as far as it came."""
+        with suppress(Exception):  # the reading may be what was wrong
+            self.telemetry.repeat_stopped(
+                stamp_ns=now_ns,
+                time_ns=now_ns - self._times.session_start_ns,
+                lateness_ns=lateness_ns,
+                state=self._supervisor.state,
+                requests=asked,
+                read_ns=self._stages_ns[_READ],
+                step_ns=self._stages_ns[_STEP],
+                reading=None
+                if reading is None
+                else (
+                    reading.position_rad,
+                    reading.velocity_rad_s,
+                    reading.wrench[: self._robot.task_dimension],
+                ),
+            )
+
+    def _count_rejected(self) -> None:
+        rejected = self.channel.counters.rejected
+        total = rejected.total()
+        if total != self._rejected_total:
+            self._rejected_total = total
+            self._rejected = [min(rejected[reason], _MOST_COUNTED) for reason in Reject]
 
     def _nearest(
         self, distance: Callable[[FloatArray, FloatArray], float], origins_m: FloatArray

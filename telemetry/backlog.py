@@ -2,19 +2,8 @@
 
 import threading
 from collections import deque
-from typing import NamedTuple
 
-import numpy as np
-
-from telemetry.row_ring import SiteEvent
-from telemetry.rows import RowArray
-
-
-class Piece(NamedTuple):
-    """Consecutive rows, and the events among them."""
-
-    rows: RowArray
-    events: tuple[SiteEvent, ...]
+from telemetry.piece import Piece
 
 
 class Backlog:
@@ -36,17 +25,17 @@ class Backlog:
         """Add the newest piece; what there is no room for is dropped, the oldest first."""
         with self._lock:
             self._pieces.append(piece)
-            self._bytes += piece.rows.nbytes
+            self._bytes += piece.nbytes
             while self._bytes > self._most_bytes:
                 oldest = self._pieces.popleft()
-                self._bytes -= oldest.rows.nbytes
+                self._bytes -= oldest.nbytes
                 self._dropped += len(oldest.rows)
 
     def put_back(self, piece: Piece) -> None:
         """Return what was taken and could not be written; the next `put` looks for its room."""
         with self._lock:
             self._pieces.appendleft(piece)
-            self._bytes += piece.rows.nbytes
+            self._bytes += piece.nbytes
 
     def take(self, most_rows: int) -> Piece | None:
         """Take the oldest pieces as one, so many rows or a single piece; None if there is none."""
@@ -55,12 +44,7 @@ class Backlog:
         with self._lock:
             while self._pieces and (not taken or rows + len(self._pieces[0].rows) <= most_rows):
                 piece = self._pieces.popleft()
-                self._bytes -= piece.rows.nbytes
+                self._bytes -= piece.nbytes
                 rows += len(piece.rows)
                 taken.append(piece)
-        if not taken:
-            return None
-        return Piece(
-            np.concatenate([piece.rows for piece in taken]),
-            tuple(event for piece in taken for event in piece.events),
-        )
+        return Piece.joined(taken) if taken else None

@@ -71,8 +71,8 @@ class EventLog:
         now_ns = int(times_ns[-1])
         events = []
         for field, text in _COUNTERS:
-            count = int(rows[field][-1])
-            more = count - self._counted.setdefault(field, int(rows[field][0]))
+            count = int(rows[field][-1].sum())
+            more = count - self._counted.setdefault(field, int(rows[field][0].sum()))
             if more and self._due(field, now_ns):
                 self._counted[field] = count
                 # A counter that falls was set to zero by a restart: nothing to tell.

@@ -1,4 +1,4 @@
-"""The rows and events around an incident, picked out while they pass by."""
+"""What was recorded around an incident, picked out while they pass by."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import RowArray
 
@@ -17,12 +18,11 @@ DIED: Final = "died"
 
 @dataclass(frozen=True, slots=True)
 class Incident:
-    """What happened at `stamp_ns` on the site's clock, with the rows and events around it."""
+    """What happened at `stamp_ns` on the site's clock, with what was recorded around it."""
 
     why: str
     stamp_ns: int
-    rows: RowArray
-    events: tuple[SiteEvent, ...]
+    around: Piece
 
 
 class IncidentWatch:
@@ -34,17 +34,21 @@ class IncidentWatch:
     def __init__(self, states: Mapping[int, str]) -> None:
         self._states = states
         self._rows: deque[RowArray] = deque()
+        self._arrivals: deque[RowArray] = deque()
         self._events: deque[SiteEvent] = deque()
         self._state: int | None = None
         self._newest_ns = 0
         self._open: tuple[int, str] | None = None
 
-    def observe(self, rows: RowArray, events: tuple[SiteEvent, ...]) -> Incident | None:
-        """Take note of the next rows, about a second of them at most, and the events among them.
+    def observe(self, piece: Piece) -> Incident | None:
+        """Take note of the next rows, about a second of them at most, and what comes with them.
 
         Return the incident that these make complete.
         """
-        self._events.extend(events)
+        rows = piece.rows
+        self._events.extend(piece.events)
+        if len(piece.arrivals):
+            self._arrivals.append(piece.arrivals)
         if len(rows):
             self._rows.append(rows)
             self._newest_ns = int(rows["stamp_ns"][-1])
@@ -80,11 +84,17 @@ class IncidentWatch:
         within = (rows["stamp_ns"] >= first_ns) & (rows["stamp_ns"] <= last_ns)
         # An event that tells of the end may be later than every row.
         events = tuple(event for event in self._events if event.stamp_ns >= first_ns)
-        return Incident(why, stamp_ns, rows[within], events)
+        rows = rows[within]
+        arrivals = np.concatenate((NO_ARRIVALS, *self._arrivals))
+        taken = (arrivals["row"] >= rows["sequence"][0]) & (arrivals["row"] <= rows["sequence"][-1])
+        return Incident(why, stamp_ns, Piece(rows, events, arrivals[taken]))
 
     def _forget(self) -> None:
         start_ns = (self._newest_ns if self._open is None else self._open[0]) - BEFORE_NS
         while self._rows and self._rows[0]["stamp_ns"][-1] < start_ns:
             self._rows.popleft()
+        first = self._rows[0]["sequence"][0] if self._rows else 0
+        while self._arrivals and self._arrivals[0]["row"][-1] < first:
+            self._arrivals.popleft()
         while self._events and self._events[0].stamp_ns < start_ns:
             self._events.popleft()

@@ -1,6 +1,6 @@
 """The flight recorder, in a process of its own: `python -m telemetry.recorder`.
 
-It reads one site's rows and events from shared memory, and writes them to the site's own disk. The
+It reads what a site puts into shared memory, and writes it to the site's own disk. The
 first line of its standard input tells what to do; when that input ends, the site has: the kernel
 closes the other end however the site dies, and what the site had put is still in the memory.
 """
@@ -22,11 +22,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Final, Self
 
-from telemetry.backlog import Backlog, Piece
+import numpy as np
+
+from telemetry.backlog import Backlog
 from telemetry.incidents import Incident, IncidentWatch
+from telemetry.piece import Piece
 from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import RecorderStatus, RowRing, SiteEvent
-from telemetry.rows import LAYOUT_VERSION
+from telemetry.rows import LAYOUT_VERSION, RowArray
 from telemetry.segments import SEGMENT_S, delete_oldest, incident_path, segment_path
 from telemetry.stream import FAREWELL
 
@@ -105,6 +108,7 @@ class Recorder:
         self._backlog = Backlog(options.backlog_bytes)
         self._next_row = 0
         self._next_event = 0
+        self._next_arrival = 0
         self._said_farewell = False
         self._overwritten = 0
         self._unwritten = 0
@@ -135,14 +139,23 @@ class Recorder:
         self.finish()
 
     def drain(self) -> None:
-        """Copy all rows and events that are new."""
-        rows = self._ring.rows_from(self._next_row, PIECE_ROWS)
+        """Copy all that is new."""
         events, self._next_event = self._ring.events_from(self._next_event)
         self._said_farewell = self._said_farewell or any(e.text == FAREWELL for e in events)
-        self._take(Piece(rows, tuple(events)))
+        rows = self._ring.rows_from(self._next_row, PIECE_ROWS)
+        self._take(Piece(rows, tuple(events), self._arrivals_for(rows)))
         while len(rows) == PIECE_ROWS:
             rows = self._ring.rows_from(self._next_row, PIECE_ROWS)
-            self._take(Piece(rows, ()))
+            self._take(Piece(rows, (), self._arrivals_for(rows)))
+
+    def _arrivals_for(self, rows: RowArray) -> RowArray:
+        """Take what arrived up to the last of these rows: it is there before the row is."""
+        arrivals = self._ring.arrivals_from(self._next_arrival)
+        last = rows["sequence"][-1] if len(rows) else 0
+        arrivals = arrivals[: np.searchsorted(arrivals["row"], last, side="right")]
+        if len(arrivals):
+            self._next_arrival = int(arrivals["number"][-1]) + 1
+        return arrivals
 
     def finish(self) -> None:
         """Write all that is left of a site that has ended, and close the file."""
@@ -161,7 +174,7 @@ class Recorder:
             self._next_row = int(rows["sequence"][-1]) + 1
         elif not piece.events:
             return
-        incident = self._watch.observe(*piece)
+        incident = self._watch.observe(piece)
         if incident is not None:
             self._incidents.append(incident)
         self._backlog.put(piece)
@@ -222,12 +235,12 @@ class Recorder:
             self._segment = segment = None
         if segment is None:
             segment = self._open_segment()
-        events = piece.events
         lost = self._lost
         if lost > self._told_lost:
             cause = self._error or "the recorder was held up"
-            events = (self._note(f"{lost - self._told_lost} rows lost: {cause}"), *events)
-        segment.write(piece.rows, events)
+            note = self._note(f"{lost - self._told_lost} rows lost: {cause}")
+            piece = piece._replace(events=(note, *piece.events))
+        segment.write(piece)
         segment.flush()
         self._told_lost = lost
 
@@ -246,7 +259,7 @@ class Recorder:
         path.unlink(missing_ok=True)  # what is left of a try before
         file = RecordingWriter(path, self._source)
         try:
-            file.write(incident.rows, incident.events)
+            file.write(incident.around)
             file.close()
         except OSError:
             file.abandon()

@@ -1,4 +1,4 @@
-"""One recording of one site: an MCAP file with its rows, its events and what explains them.
+"""One recording of one site: an MCAP file with its rows, arrivals, events and what explains them.
 
 A file that ends anywhere is read up to its last whole chunk. Described in docs/recording.md.
 """
@@ -19,13 +19,17 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
+from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.ros_messages import (
+    ARRIVALS_SCHEMA,
     EVENT_SCHEMA,
     MESSAGE_ENCODING,
     SCHEMA_ENCODING,
+    decode_arrivals,
     decode_event,
     decode_rows,
     dtype_of,
+    encode_arrivals,
     encode_event,
     encode_rows,
     row_schema,
@@ -64,6 +68,8 @@ class RecordingWriter:
     def __init__(self, path: Path, source: RecordingSource) -> None:
         self._offset_ns = source.wall_offset_ns
         self._events = 0
+        self._arrivals = 0
+        self._arrivals_at_ns = 0
         self._file = _File(path)
         self._writer = writer = Writer(self._file, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         writer.start()
@@ -72,6 +78,9 @@ class RecordingWriter:
             f"/{source.site}/rows", f"{kind}Row", row_schema(source.joints, source.dimension)
         )
         self._event_channel = self._channel(f"/{source.site}/events", f"{kind}Event", EVENT_SCHEMA)
+        self._arrivals_channel = self._channel(
+            f"/{source.site}/arrivals", "farhand/msg/Arrivals", ARRIVALS_SCHEMA
+        )
         told = {
             "site": source.site,
             "joints": str(source.joints),
@@ -87,13 +96,20 @@ class RecordingWriter:
             path.unlink()
             raise
 
-    def write(self, rows: RowArray, events: Sequence[SiteEvent]) -> None:
-        """Add rows and events; they are in the file after the next `flush`."""
+    def write(self, piece: Piece) -> None:
+        """Add what was recorded next; it is in the file after the next `flush`."""
+        rows = piece.rows
         stamps_ns = self._log_times(rows["stamp_ns"])
         numbers = (rows["sequence"] % 2**32).tolist()
         for message, at, number in zip(encode_rows(rows), stamps_ns, numbers, strict=True):
             self._writer.add_message(self._row_channel, at, message, at, number)
-        for event in events:
+        if len(piece.arrivals):
+            # they have no time of their own: that of their rows, or of the last ones before
+            self._arrivals_at_ns = stamps_ns[-1] if stamps_ns else self._arrivals_at_ns
+            at, message = self._arrivals_at_ns, encode_arrivals(piece.arrivals)
+            self._writer.add_message(self._arrivals_channel, at, message, at, self._arrivals)
+            self._arrivals += 1
+        for event in piece.events:
             at = max(event.stamp_ns + self._offset_ns, 0)
             self._writer.add_message(self._event_channel, at, encode_event(event), at, self._events)
             self._events += 1
@@ -167,11 +183,13 @@ class Gap:
 class Recording:
     """What was recorded of one site: rows bit by bit as they were put, and events, in order.
 
+    `arrivals`, dtype `ARRIVAL`, are all datagrams that the site took from the network.
     `complete` says that every file was closed properly and could be read to its end.
     """
 
     rows: RowArray
     events: tuple[SiteEvent, ...]
+    arrivals: RowArray
     metadata: Mapping[str, str]
     session_text: str
     complete: bool
@@ -213,6 +231,7 @@ def _joined(parts: Sequence[Recording]) -> Recording:
     return Recording(
         np.concatenate([part.rows for part in parts]),
         tuple(event for part in parts for event in part.events),
+        np.concatenate([part.arrivals for part in parts]),
         parts[0].metadata,
         parts[0].session_text,
         all(part.complete for part in parts),
@@ -236,6 +255,9 @@ def _read(path: Path) -> Recording:
     return Recording(
         contents.rows(),
         tuple(decode_event(message) for message in contents.messages("/events")),
+        np.concatenate(
+            (NO_ARRIVALS, *(decode_arrivals(m) for m in contents.messages("/arrivals")))
+        ),
         contents.metadata,
         contents.session_text,
         complete,

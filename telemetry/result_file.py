@@ -3,7 +3,7 @@
 The columns are described in docs/result_file.md.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from types import MappingProxyType
@@ -14,7 +14,13 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from telemetry.rows import COLUMNS, LAYOUT_VERSION, RowArray, TelemetryError
+from telemetry.rows import (
+    COLUMNS,
+    LAYOUT_VERSION,
+    REJECT_REASONS,
+    RowArray,
+    TelemetryError,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -37,14 +43,19 @@ class Result:
 def column_names(field: str, length: int) -> tuple[str, ...]:
     """Names of the columns that hold one field, without the site: `q_1`, `position_x`, `state`.
 
-    Numbered by joint, lettered by axis; there the unit is left to the metadata of the column.
+    Numbered by joint, lettered by axis, there the unit is left to the metadata of the column; named
+    by reason.
     """
     column = COLUMNS[field]
     if column.axis == "scalar":
         return (field,)
     stem = field.removesuffix(_UNIT_SUFFIX.get(column.unit, ""))
-    suffixes = "xyz" if column.axis == "task" else range(1, length + 1)
-    return tuple(f"{stem}_{suffix}" for suffix, _ in zip(suffixes, range(length), strict=False))
+    suffixes: Mapping[str, Sequence[str | int]] = {
+        "task": "xyz",
+        "joint": range(1, length + 1),
+        "reason": [reason.replace(" ", "_").replace("-", "_") for reason in REJECT_REASONS],
+    }
+    return tuple(f"{stem}_{suffix}" for suffix in suffixes[column.axis][:length])
 
 
 def write_result(

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from telemetry.row_ring import SiteEvent
+from telemetry.row_ring import ARRIVAL, ARRIVAL_BYTES, SiteEvent
 from telemetry.rows import COLUMNS, RowArray, TelemetryError, row_dtype
 
 SCHEMA_ENCODING: Final = "ros2msg"
@@ -24,9 +24,21 @@ int64 stamp_ns  # [ns] On the site's own clock
 string text
 """
 
+ARRIVALS_SCHEMA: Final = f"""\
+# Datagrams that the link brought, as they came; their format is that of docs/packet.md.
+Arrival[] arrivals
+================================================================================
+MSG: farhand/Arrival
+uint64 number  # [1] Arrivals before this one
+uint64 row  # [1] Sequence of the row of the tick that took it
+uint32 length  # [1] Bytes that it had; of a longer one than there is room for, the first are kept
+uint8[{ARRIVAL_BYTES}] data
+"""
+
 _CDR_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 _ENCAPSULATION: Final = "encapsulation"
 _EVENT: Final = struct.Struct("<qI")
+_COUNT: Final = struct.Struct("<I4x")  # what follows is aligned to its largest number
 _FIELD: Final = re.compile(r"(?P<type>\w+?)(\[(?P<length>\d+)\])? (?P<name>\w+)")
 _ROS_TYPES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -111,6 +123,18 @@ def decode_rows(messages: list[bytes], dtype: np.dtype[np.void]) -> RowArray:
     for name in dtype.names or ():
         rows[name] = whole[name]
     return rows
+
+
+def encode_arrivals(arrivals: RowArray) -> bytes:
+    """Return one message of all these, dtype `ARRIVAL`."""
+    return _CDR_LITTLE_ENDIAN + _COUNT.pack(len(arrivals)) + arrivals.tobytes()
+
+
+def decode_arrivals(message: bytes) -> RowArray:
+    """Return the arrivals that `encode_arrivals` made a message of."""
+    start = len(_CDR_LITTLE_ENDIAN)
+    (count,) = _COUNT.unpack_from(message, start)
+    return np.frombuffer(message, ARRIVAL, count, start + _COUNT.size)
 
 
 def encode_event(event: SiteEvent) -> bytes:

@@ -1,8 +1,8 @@
-"""The rows and events of one site in memory that another process may read while they are written.
+"""The rows of one site in memory that other processes may read while they are written.
 
-One writer, the site, and one reader, the recorder; neither waits for the other. A row is counted
-after it is whole, so a writer killed at any moment leaves no torn row to be read. This, and reading
-while the other writes, relies on the order of stores that x86 keeps.
+With them the packets that arrived, and events. One writer, the site; nobody waits for another. A
+row is counted after it is whole, so a writer killed at any moment leaves no torn row to be read.
+This, and reading while the other writes, relies on the order of stores that x86 keeps.
 """
 
 import mmap
@@ -22,10 +22,21 @@ EVENT_BYTES: Final = 240
 """Longest text of an event, in UTF-8; the rest is cut off."""
 
 EVENT_CAPACITY: Final = 256
+ARRIVAL_BYTES: Final = 160
+"""More than any packet has; the rest of a longer datagram is cut off."""
+
+ARRIVAL_CAPACITY: Final = 32_768
 
 # magic, layout version, site, joints, dimension, capacity, session digest, epoch
 _HEADER: Final = struct.Struct("<8sBBBBIQQ")
 _EVENT: Final = np.dtype([("stamp_ns", "<i8"), ("text", f"S{EVENT_BYTES}")])
+ARRIVAL: Final = np.dtype(
+    [("number", "<u8"), ("row", "<u8"), ("length", "<u4"), ("data", "u1", (ARRIVAL_BYTES,))],
+    align=True,
+)
+"""A datagram that the link brought: how many came before, the row of its tick, its true length."""
+
+_ARRIVAL: Final = struct.Struct(f"<QQI{ARRIVAL_BYTES}s4x")
 _STATUS: Final = np.dtype(
     [
         ("recording", "<u8"),
@@ -39,7 +50,8 @@ _STATUS: Final = np.dtype(
 _COUNTS_AT: Final = 64
 _STATUS_AT: Final = 128
 _EVENTS_AT: Final = 512
-_ROWS_AT: Final = -(-(_EVENTS_AT + EVENT_CAPACITY * _EVENT.itemsize) // 4096) * 4096
+_ARRIVALS_AT: Final = -(-(_EVENTS_AT + EVENT_CAPACITY * _EVENT.itemsize) // 4096) * 4096
+_ROWS_AT: Final = -(-(_ARRIVALS_AT + ARRIVAL_CAPACITY * ARRIVAL.itemsize) // 4096) * 4096
 
 
 class SiteEvent(NamedTuple):
@@ -76,7 +88,7 @@ class RecorderStatus:
 
 
 class RowRing:
-    """A ring of rows, a ring of events and the recorder's status, all in one piece of memory.
+    """Rings of rows, arrivals and events, and the recorder's status, in one piece of memory.
 
     The writer fills `rows[n % capacity]` and then calls `count_row`. In simulation, the memory is
     the process's own.
@@ -86,8 +98,10 @@ class RowRing:
         dtype = row_dtype(layout.joints, layout.dimension)
         self.layout = layout
         self.rows: RowArray = np.frombuffer(memory, dtype, layout.capacity, _ROWS_AT)
-        counts = memoryview(memory)[_COUNTS_AT : _COUNTS_AT + 16].cast("Q")
+        counts = memoryview(memory)[_COUNTS_AT : _COUNTS_AT + 24].cast("Q")
         self._counts = counts
+        self._memory = memory
+        self._arrivals: RowArray = np.frombuffer(memory, ARRIVAL, ARRIVAL_CAPACITY, _ARRIVALS_AT)
         events: RowArray = np.frombuffer(memory, _EVENT, EVENT_CAPACITY, _EVENTS_AT)
         self._event_stamp_ns = events["stamp_ns"]
         self._event_text = events["text"]
@@ -137,6 +151,13 @@ class RowRing:
         """Let readers see all rows up to this many; real-time safe."""
         self._counts[0] = count
 
+    def put_arrival(self, row: int, data: bytes) -> None:
+        """Write a datagram that arrived for this row; real-time safe."""
+        count = self._counts[2]
+        at = _ARRIVALS_AT + count % ARRIVAL_CAPACITY * _ARRIVAL.size
+        _ARRIVAL.pack_into(self._memory, at, count, row, len(data), data)
+        self._counts[2] = count + 1
+
     def put_event(self, stamp_ns: int, text: str) -> None:
         """Write an event; real-time safe. Text beyond `EVENT_BYTES` is cut off."""
         count = self._counts[1]
@@ -168,6 +189,14 @@ class RowRing:
         ]
         overwritten = self._counts[1] - EVENT_CAPACITY + 1 - start
         return events[max(overwritten, 0) :], written
+
+    def arrivals_from(self, first: int) -> RowArray:
+        """Copy the arrivals, dtype `ARRIVAL`, from number `first` on; later ones if overwritten."""
+        written = self._counts[2]
+        start = max(first, written - ARRIVAL_CAPACITY)
+        arrivals = self._arrivals[np.arange(start, written) % ARRIVAL_CAPACITY]
+        overwritten = self._counts[2] - ARRIVAL_CAPACITY + 1 - start
+        return arrivals[max(overwritten, 0) :]
 
     @property
     def status(self) -> RecorderStatus:

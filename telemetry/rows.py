@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 RowArray: TypeAlias = npt.NDArray[np.void]
 
-LAYOUT_VERSION: Final = 2
+LAYOUT_VERSION: Final = 3
 """Raised whenever a field of `COLUMNS` is added, removed, moved or changes its meaning."""
 
 NO_PEER_STATE: Final = 255
@@ -17,6 +17,22 @@ NO_PEER_STATE: Final = 255
 
 MAX_JOINTS: Final = 16
 DIMENSIONS: Final = (2, 3)
+
+REJECT_REASONS: Final = (
+    "length",
+    "magic",
+    "version",
+    "dimension",
+    "checksum",
+    "non-finite",
+    "site",
+    "session",
+    "epoch",
+    "duplicate",
+    "out of order",
+    "stamp",
+)
+"""Why packets are refused, in the order of the `rejected` counts."""
 
 
 class TelemetryError(Exception):
@@ -27,7 +43,7 @@ class Column(NamedTuple):
     """What one field of a row is: its number format, its length, its unit and its meaning."""
 
     format: str
-    axis: Literal["scalar", "joint", "task"]
+    axis: Literal["scalar", "joint", "task", "reason"]
     unit: str
     meaning: str
 
@@ -39,8 +55,18 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         "time_ns": Column("<i8", "scalar", "ns", "Start of the tick since the session started"),
         "lateness_ns": Column("<i8", "scalar", "ns", "Wake-up after the tick's deadline"),
         "duration_ns": Column("<i8", "scalar", "ns", "Computing time of the previous tick"),
+        "read_ns": Column("<u4", "scalar", "ns", "Tick's start until the device was read"),
+        "step_ns": Column("<u4", "scalar", "ns", "Tick's start until the guard passed the torque"),
+        "write_ns": Column("<u4", "scalar", "ns", "Tick's start until the torque was written"),
+        "sent_ns": Column("<u4", "scalar", "ns", "Tick's start until a packet left; 0: none did"),
         "state": Column("u1", "scalar", "1", "Supervisor state of this site"),
         "peer_state": Column("u1", "scalar", "1", "Supervisor state of the peer; 255: none heard"),
+        "requests": Column(
+            "u1",
+            "scalar",
+            "1",
+            "Asked for: 1 the device's clutch, 2 clutch, 4 emergency stop, 8 reset",
+        ),
         "cut": Column("<u2", "scalar", "1", "Limits the guard applied in this tick, one bit each"),
         "q": Column("<f8", "joint", "rad", "Joint angles"),
         "q_dot": Column("<f8", "joint", "rad/s", "Joint speeds"),
@@ -57,6 +83,18 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         "offset_m": Column("<f8", "task", "m", "What the clutch put between the robots' points"),
         "force_share": Column(
             "<f8", "scalar", "1", "Share of stiffness and force ceiling in force: ramp, de-rating"
+        ),
+        "used_stamp_ns": Column(
+            "<i8", "scalar", "ns", "Stamp of the peer's sample in use, on its clock; 0: none"
+        ),
+        "used_arrival_ns": Column(
+            "<i8", "scalar", "ns", "Tick at which that sample came, on this clock; 0: none"
+        ),
+        "clock_offset_ns": Column(
+            "<i8", "scalar", "ns", "From the peer's clock to this one, an estimate; 0: none"
+        ),
+        "clock_uncertainty_ns": Column(
+            "<i8", "scalar", "ns", "The estimate is right to within so much; -1: none"
         ),
         "one_way_delay_s": Column(
             "<f8", "scalar", "s", "Age of the peer sample in use, from the clock offset; NaN: none"
@@ -82,7 +120,7 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         ),
         "lost": Column("<u4", "scalar", "1", "Packets of the peer that never came, so far"),
         "late": Column("<u4", "scalar", "1", "Packets of the peer that came too late, so far"),
-        "rejected": Column("<u4", "scalar", "1", "Packets refused as invalid or foreign, so far"),
+        "rejected": Column("<u4", "reason", "1", "Packets refused so far, by reason"),
         "missed": Column("<u4", "scalar", "1", "Ticks skipped because the loop was late, so far"),
     }
 )
@@ -98,7 +136,7 @@ def row_dtype(joints: int, dimension: int) -> np.dtype[np.void]:
         raise TelemetryError(f"{joints} joints; rows hold 1 to {MAX_JOINTS}")
     if dimension not in DIMENSIONS:
         raise TelemetryError(f"{dimension} task dimensions; rows hold 2 or 3")
-    length = {"joint": (joints,), "task": (dimension,)}
+    length = {"joint": (joints,), "task": (dimension,), "reason": (len(REJECT_REASONS),)}
     fields: list[Any] = [
         (name, column.format, length.get(column.axis, ())) for name, column in COLUMNS.items()
     ]

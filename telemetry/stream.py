@@ -1,7 +1,7 @@
 """From the control loop to the wire and back: a ring of rows, published in batches."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -85,6 +85,11 @@ class TelemetryStream:
         self._time_ns = ring["time_ns"]
         self._lateness_ns = ring["lateness_ns"]
         self._duration_ns = ring["duration_ns"]
+        self._read_ns = ring["read_ns"]
+        self._step_ns = ring["step_ns"]
+        self._write_ns = ring["write_ns"]
+        self._sent_ns = ring["sent_ns"]
+        self._requests = ring["requests"]
         self._state = ring["state"]
         self._peer_state = ring["peer_state"]
         self._cut = ring["cut"]
@@ -98,6 +103,10 @@ class TelemetryStream:
         self._peer_position_m = ring["peer_position_m"]
         self._offset_m = ring["offset_m"]
         self._force_share = ring["force_share"]
+        self._used_stamp_ns = ring["used_stamp_ns"]
+        self._used_arrival_ns = ring["used_arrival_ns"]
+        self._clock_offset_ns = ring["clock_offset_ns"]
+        self._clock_uncertainty_ns = ring["clock_uncertainty_ns"]
         self._one_way_delay_s = ring["one_way_delay_s"]
         self._round_trip_s = ring["round_trip_s"]
         self._loop_bound_s = ring["loop_bound_s"]
@@ -128,6 +137,11 @@ class TelemetryStream:
         time_ns: int,
         lateness_ns: int,
         duration_ns: int,
+        read_ns: int,
+        step_ns: int,
+        write_ns: int,
+        sent_ns: int,
+        requests: int,
         state: int,
         peer_state: int,
         cut: int,
@@ -141,6 +155,10 @@ class TelemetryStream:
         peer_position_m: FloatArray | float,
         offset_m: FloatArray,
         force_share: float,
+        used_stamp_ns: int,
+        used_arrival_ns: int,
+        clock_offset_ns: int,
+        clock_uncertainty_ns: int,
         one_way_delay_s: float,
         round_trip_s: float,
         loop_bound_s: float,
@@ -151,14 +169,14 @@ class TelemetryStream:
         sub_task_error_rad_s: float,
         lost: int,
         late: int,
-        rejected: int,
+        rejected: Sequence[int],
         missed: int,
     ) -> None:
         """Write one row into the ring; real-time safe. Fields as in `COLUMNS`.
 
-        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. A counter
-        stays at the most that it holds. A row whose assignment raises (a wrong shape) is not
-        counted.
+        Arrays are copied. Where there is no peer, `peer_position_m` may be a plain NaN. What would
+        not fit stays at the most that a column holds. A row whose assignment raises (a wrong shape)
+        is not counted.
         """
         i = self._count % self._capacity
         self._sequence[i] = self._count
@@ -166,6 +184,11 @@ class TelemetryStream:
         self._time_ns[i] = time_ns
         self._lateness_ns[i] = lateness_ns
         self._duration_ns[i] = duration_ns
+        self._read_ns[i] = min(read_ns, _MOST)
+        self._step_ns[i] = min(step_ns, _MOST)
+        self._write_ns[i] = min(write_ns, _MOST)
+        self._sent_ns[i] = min(sent_ns, _MOST)
+        self._requests[i] = requests
         self._state[i] = state
         self._peer_state[i] = peer_state
         self._cut[i] = cut
@@ -179,6 +202,10 @@ class TelemetryStream:
         self._peer_position_m[i] = peer_position_m
         self._offset_m[i] = offset_m
         self._force_share[i] = force_share
+        self._used_stamp_ns[i] = used_stamp_ns
+        self._used_arrival_ns[i] = used_arrival_ns
+        self._clock_offset_ns[i] = clock_offset_ns
+        self._clock_uncertainty_ns[i] = clock_uncertainty_ns
         self._one_way_delay_s[i] = one_way_delay_s
         self._round_trip_s[i] = round_trip_s
         self._loop_bound_s[i] = loop_bound_s
@@ -189,16 +216,28 @@ class TelemetryStream:
         self._sub_task_error_rad_s[i] = sub_task_error_rad_s
         self._lost[i] = min(lost, _MOST)
         self._late[i] = min(late, _MOST)
-        self._rejected[i] = min(rejected, _MOST)
+        self._rejected[i] = rejected
         self._missed[i] = min(missed, _MOST)
         self._count += 1
         self._count_row(self._count)
 
-    def repeat_stopped(self, *, stamp_ns: int, time_ns: int, lateness_ns: int, state: int) -> None:
-        """Write the newest row again for a site that no longer reads its device; real-time safe.
+    def repeat_stopped(
+        self,
+        *,
+        stamp_ns: int,
+        time_ns: int,
+        lateness_ns: int,
+        state: int,
+        requests: int,
+        read_ns: int = 0,
+        step_ns: int = 0,
+        reading: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+    ) -> None:
+        """Write the newest row again for a site that no longer drives its device; real-time safe.
 
-        Its outputs are off: no torque, no coupling, nothing cut. Without any row, there is nothing
-        to repeat.
+        Its outputs are off: no torque, no coupling, nothing cut. A tick that failed on the way
+        tells how far it came, and its reading (q, q̇, external force). Without any row, there is
+        nothing to repeat.
         """
         if self._count == 0:
             return
@@ -208,13 +247,26 @@ class TelemetryStream:
         self._stamp_ns[i] = stamp_ns
         self._time_ns[i] = time_ns
         self._lateness_ns[i] = lateness_ns
+        self._read_ns[i] = min(read_ns, _MOST)
+        self._step_ns[i] = min(step_ns, _MOST)
+        self._write_ns[i] = 0
+        self._sent_ns[i] = 0
+        self._requests[i] = requests
         self._state[i] = state
         self._cut[i] = 0
+        if reading is not None:
+            self._q[i], self._q_dot[i], self._external_force_n[i] = reading
         self._torque_nm[i] = 0.0
         self._coupling_force_n[i] = 0.0
         self._force_share[i] = 0.0
         self._count += 1
         self._count_row(self._count)
+
+    def arrived(self, packets: Sequence[bytes]) -> None:
+        """Tell the recorder what the link brought for the row to come; real-time safe."""
+        put, row = self.ring.put_arrival, self._count
+        for packet in packets:
+            put(row, packet)
 
     def event(self, stamp_ns: int, text: str) -> None:
         """Tell the recorder what happened, in at most 240 bytes of UTF-8; real-time safe."""

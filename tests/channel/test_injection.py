@@ -89,7 +89,7 @@ def test_exact_is_its_definition(
         targets.append(target_ms)
         expected = newest([stamp for stamp in arrived if stamp <= target_ms])
         chosen = under_test.choose(now_ms * MS, offset_ns)
-        assert (chosen and (chosen.stamp_ns + offset_ns) // MS) == expected
+        assert (chosen and (chosen.packet.stamp_ns + offset_ns) // MS) == expected
     assert under_test.late == late
 
 
@@ -102,7 +102,9 @@ def test_exact_stays_exact_while_it_forgets(delay: UniformDelay | SinusoidDelay)
         under_test.put(packet(now_ns, tick), now_ns)
         target_ns = now_ns - round(delay.at(now_ns * 1e-9, twin) * 1e9)
         chosen = under_test.choose(now_ns, 0)
-        assert (chosen and chosen.stamp_ns) == (target_ns // MS * MS if target_ns >= 0 else None)
+        assert (chosen and chosen.packet.stamp_ns) == (
+            target_ns // MS * MS if target_ns >= 0 else None
+        )
         most = max(most, len(under_test._stamps))
     assert most < 2000
     assert under_test.late == 0
@@ -115,7 +117,7 @@ def test_exact_keeps_the_last_sample_of_a_silent_peer() -> None:
     for now_ns in (2 * S, 60 * S, 3600 * S):
         chosen = under_test.choose(now_ns, 0)
         assert chosen is not None
-        assert chosen.stamp_ns == 999 * MS
+        assert chosen.packet.stamp_ns == 999 * MS
 
 
 def test_a_flood_is_forgotten_not_kept() -> None:
@@ -139,8 +141,8 @@ def test_exact_absorbs_the_network_and_counts_what_it_cannot() -> None:
         on_time, too_late = absorbed.choose(now_ns, 0), exceeded.choose(now_ns, 0)
     assert on_time is not None
     assert too_late is not None
-    assert now_ns - on_time.stamp_ns == 100 * MS
-    assert now_ns - too_late.stamp_ns == 130 * MS
+    assert now_ns - on_time.packet.stamp_ns == 100 * MS
+    assert now_ns - too_late.packet.stamp_ns == 130 * MS
     assert absorbed.late == 0
     assert exceeded.late == 870
 
@@ -154,7 +156,7 @@ def test_added_comes_on_top_of_the_network() -> None:
         chosen = under_test.choose(now_ns, 0)
         assert (chosen is None) == (tick < 160)
     assert chosen is not None
-    assert now_ns - chosen.stamp_ns == 160 * MS
+    assert now_ns - chosen.packet.stamp_ns == 160 * MS
 
 
 @settings(deadline=None)
@@ -173,7 +175,7 @@ def test_added_uses_the_newest_released(delays_ms: list[int]) -> None:
             if sent + delays_ms[sent] <= now_ms
         ]
         chosen = under_test.choose(now_ms * MS, 0)
-        assert (chosen and chosen.sequence) == newest(released)
+        assert (chosen and chosen.packet.sequence) == newest(released)
     order = sorted(range(len(delays_ms)), key=lambda sent: (sent + delays_ms[sent], sent))
     for sent in order:
         if best is not None and sent < best:
@@ -192,7 +194,7 @@ def test_delays_run_on_session_time() -> None:
         chosen = under_test.choose(now_ns, 0)
         age_s = delay.at((now_ns - start_ns) * 1e-9, np.random.default_rng())
         if chosen is not None:
-            assert 0.0 <= (now_ns - chosen.stamp_ns) * 1e-9 - age_s < 0.001 + 1e-9
+            assert 0.0 <= (now_ns - chosen.packet.stamp_ns) * 1e-9 - age_s < 0.001 + 1e-9
 
 
 def test_off_uses_the_newest_and_ignores_the_direction() -> None:
@@ -204,7 +206,7 @@ def test_off_uses_the_newest_and_ignores_the_direction() -> None:
         under_test.put(packet(5, 1), 10)
         chosen = under_test.choose(10, 0)
         assert chosen is not None
-        assert chosen.sequence == 1
+        assert chosen.packet.sequence == 1
 
 
 def test_gilbert_elliott_statistics() -> None:
@@ -243,7 +245,7 @@ def test_reordering_holds_packets_back(mode: DelayMode) -> None:
         chosen = under_test.choose(now_ns, 0)
         if tick >= 100:
             assert chosen is not None
-            assert 10 * MS <= now_ns - chosen.stamp_ns <= 30 * MS
+            assert 10 * MS <= now_ns - chosen.packet.stamp_ns <= 30 * MS
     assert under_test.overtaken == pytest.approx(1000, rel=0.1)
     # held back beyond the exact delay, each of them missed the tick it was due at
     assert under_test.late == (under_test.overtaken if mode == "exact" else 0)
@@ -259,7 +261,7 @@ def run(seed: int, mode: DelayMode) -> list[int | None]:
         if under_test.copies():
             under_test.put(packet(tick * MS, tick), tick * MS)
         sample = under_test.choose(tick * MS, 0)
-        chosen.append(sample.sequence if sample is not None else None)
+        chosen.append(sample.packet.sequence if sample is not None else None)
     return chosen
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from channel.link import Link
+from channel.link import Link, TappedLink
 from channel.memory_link import memory_links
 from channel.zenoh_link import ZenohNode, ZenohSettings
 
@@ -33,10 +33,13 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-@pytest.fixture(params=["memory", "zenoh"])
+@pytest.fixture(params=["memory", "tapped", "zenoh"])
 def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
     if request.param == "memory":
         yield Pair(*memory_links(CAPACITY))
+        return
+    if request.param == "tapped":
+        yield Pair(*(TappedLink(link, lambda _: None) for link in memory_links(CAPACITY)))
         return
     endpoint = free_endpoint()
     listening = ZenohNode(ZenohSettings(listen=(endpoint,)))
@@ -49,6 +52,17 @@ def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
     yield links
     connecting.close()
     listening.close()
+
+
+def test_a_tap_sees_what_arrives_in_the_order_it_arrived() -> None:
+    seen: list[bytes] = []
+    mine, theirs = memory_links(CAPACITY)
+    tapped = TappedLink(mine, seen.extend)
+    for data in (b"one", b"two", b"three"):
+        theirs.send(data)
+        assert tapped.receive() == [data]
+    assert tapped.receive() == []
+    assert seen == [b"one", b"two", b"three"]
 
 
 def collect(link: Link, last: bytes) -> list[bytes]:

@@ -40,13 +40,15 @@ def batch_of(session: Session) -> bytes:
     stream = TelemetryStream(2, 2, SiteId.LOCAL, session.digest, 1, published.append)
     zeros = np.zeros(2)
     stream.put(
-        stamp_ns=1, time_ns=1, lateness_ns=0, duration_ns=0, state=1, peer_state=255, cut=0,
+        stamp_ns=1, time_ns=1, lateness_ns=0, duration_ns=0, read_ns=0, step_ns=0, write_ns=0,
+        sent_ns=0, requests=0, state=1, peer_state=255, cut=0,
         q=zeros, q_dot=zeros, torque_nm=zeros, position_m=zeros, velocity_m_s=zeros,
         external_force_n=zeros, coupling_force_n=zeros, peer_position_m=zeros,
-        offset_m=zeros, force_share=0.0, one_way_delay_s=0.0, round_trip_s=0.0, loop_bound_s=0.0,
-            certified_round_trip_s=0.3, manipulability=0.0,
-        link_distance_m=0.0, midpoint_distance_m=0.0, sub_task_error_rad_s=0.0,
-        lost=0, late=0, rejected=0, missed=0,
+        offset_m=zeros, force_share=0.0, used_stamp_ns=0, used_arrival_ns=0,
+        clock_offset_ns=0, clock_uncertainty_ns=-1,
+        one_way_delay_s=0.0, round_trip_s=0.0, loop_bound_s=0.0, certified_round_trip_s=0.3,
+        manipulability=0.0, link_distance_m=0.0, midpoint_distance_m=0.0, sub_task_error_rad_s=0.0,
+        lost=0, late=0, rejected=12 * [0], missed=0,
     )  # fmt: skip
     stream.drain()
     return published[0]

@@ -12,6 +12,7 @@ from experiments.simulation import Simulation
 from farhand.__main__ import app
 from site_runtime.session import load_session
 from site_runtime.supervisor import State
+from telemetry.piece import Piece
 from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import RowArray
@@ -44,9 +45,8 @@ def record(folder: Path, name: str, rows: RowArray, epoch: str = "9", close: boo
     }
     path = folder / f"rows-{name}-local.mcap"
     writer = RecordingWriter(path, RecordingSource("local", 2, 2, WALL_OFFSET_NS, "", metadata))
-    writer.write(
-        rows, [SiteEvent(int(rows["stamp_ns"][0]) + 5_000_000, "ENGAGED: both sites agree")]
-    )
+    event = SiteEvent(int(rows["stamp_ns"][0]) + 5_000_000, "ENGAGED: both sites agree")
+    writer.write(Piece(rows, (event,)))
     writer.flush()
     if close:
         writer.close()

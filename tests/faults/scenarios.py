@@ -154,9 +154,9 @@ def other_session(stage: Stage) -> None:
         pair.start(LOCAL)
     finally:
         pair.files[LOCAL] = ours
-    began = {site: pair.rows(site)["rejected"][-1] for site in BOTH}
+    began = {site: pair.rows(site)["rejected"][-1].sum() for site in BOTH}
     pair.until(
-        lambda: all(pair.rows(s)["rejected"][-1] > began[s] + 1000 for s in BOTH),
+        lambda: all(pair.rows(s)["rejected"][-1].sum() > began[s] + 1000 for s in BOTH),
         "both sites refuse the other's packets",
     )
     stage.never_driven(pair.daemons[LOCAL], "a site with another session file")
@@ -222,7 +222,7 @@ def flooded(name: SiteId) -> Act:
             since_ns = stage.fault()
             rate_hz = intruder.flood(name, packets, FLOOD_HZ, FLOOD_S)
         time.sleep(0.2)
-        rejected = pair.rows(name.peer, since_ns)["rejected"]
+        rejected = pair.rows(name.peer, since_ns)["rejected"].sum(axis=1)
         came_hz = (int(rejected[-1]) - int(rejected[0])) / FLOOD_S
         stage.notes.append(f"{rate_hz:.0f} Hz sent, {came_hz:.0f} Hz taken in and refused")
         if came_hz < 1000.0:

@@ -10,7 +10,7 @@ import pytest
 
 from channel.channel import Channel, PeerSample
 from channel.memory_link import MemoryLink, memory_links
-from channel.packet import Packet
+from channel.packet import Packet, Reject
 from hardware.interface import DeviceError, DeviceState, JointStops
 from hardware.robot_model import PlanarArm, RobotModel, RobotTerms, build_robot
 from site_runtime.clock import ManualClock
@@ -18,10 +18,16 @@ from site_runtime.controller import Command
 from site_runtime.guard import Cut, Guard, GuardError, Limits
 from site_runtime.keys import SiteId
 from site_runtime.margin import Margin
-from site_runtime.operator_requests import OperatorRequests
+from site_runtime.operator_requests import (
+    CLUTCH,
+    CLUTCH_BUTTON,
+    EMERGENCY_STOP,
+    RESET,
+    OperatorRequests,
+)
 from site_runtime.site import LateError, Site, SiteTimes
 from site_runtime.supervisor import EngagementRules, State, Supervisor
-from telemetry.rows import NO_PEER_STATE
+from telemetry.rows import NO_PEER_STATE, REJECT_REASONS
 from telemetry.stream import TelemetryStream, decode_batch
 
 FloatArray = npt.NDArray[np.float64]
@@ -441,6 +447,72 @@ def test_a_fault_is_in_the_rows_with_no_torque(bench: Bench) -> None:
     assert row["torque_nm"].tolist() == row["coupling_force_n"].tolist() == [0.0, 0.0]
     assert np.array_equal(row["q"], last["q"])
     assert bench.site.ticks == 9
+
+
+def test_the_row_of_the_tick_that_failed_has_its_reading_and_how_far_it_came(bench: Bench) -> None:
+    bench.engage()
+    last = bench.row()["sequence"]
+    bench.device.velocity = np.array([nan, 3.0])
+    bench.tick()
+    row = bench.row()
+    assert row["sequence"] == last + 1
+    assert (row["state"], row["cut"]) == (State.FAULT, 0)
+    assert np.isnan(row["q_dot"][0])
+    assert row["q_dot"][1] == 3.0
+    bench.tick()
+    assert bench.row()["sequence"] == last + 2
+
+
+def test_the_row_tells_what_the_operator_asked_for(bench: Bench) -> None:
+    bench.engage()
+    assert bench.row()["requests"] == 0
+    bench.requests.toggle_clutch()
+    bench.device.clutch = True
+    bench.tick()
+    assert bench.row()["requests"] == CLUTCH_BUTTON | CLUTCH
+    bench.requests.toggle_clutch()
+    bench.device.clutch = False
+    bench.requests.stop()
+    bench.tick()
+    assert bench.row()["requests"] == EMERGENCY_STOP
+    bench.requests.reset()
+    bench.tick()
+    assert bench.row()["requests"] == RESET
+
+
+def test_the_row_tells_when_each_stage_of_the_tick_was_passed(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each call takes so long, by a clock that the calls themselves advance."""
+    bench.engage()
+    took_ns = {"read": 1000, "terms": 200, "guard": 30, "write": 4, "send": 50_000}
+
+    def note(name: str) -> None:
+        bench.clock.sleep_until_ns(bench.clock.now_ns() + took_ns.get(name, 0))
+
+    monkeypatch.setattr(bench.journal, "note", note)
+    bench.tick()
+    row = bench.row()
+    stages = [int(row[name]) for name in ("read_ns", "step_ns", "write_ns", "sent_ns")]
+    assert stages == [1000, 1230, 1234, 51_234]
+
+
+def test_the_row_tells_which_sample_is_in_use_and_the_clocks_offset(bench: Bench) -> None:
+    bench.engage()
+    bench.tick()
+    row = bench.row()
+    assert row["used_stamp_ns"] == row["used_arrival_ns"] == row["stamp_ns"]  # one clock, no way
+    assert abs(row["clock_offset_ns"]) <= row["clock_uncertainty_ns"] <= MS
+
+
+def test_the_row_tells_what_was_refused_by_reason(bench: Bench) -> None:
+    assert tuple(reason.value for reason in Reject) == REJECT_REASONS
+    bench.engage()
+    for data in (b"FH", b"x" * 156, b"y" * 156):
+        bench.peer_link.send(data)
+    bench.tick()
+    counted = dict(zip(REJECT_REASONS, bench.row()["rejected"].tolist(), strict=True))
+    assert {name: count for name, count in counted.items() if count} == {"length": 1, "magic": 2}
 
 
 @pytest.mark.parametrize("reading", ["position", "velocity", "wrench"])

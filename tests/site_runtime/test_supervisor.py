@@ -73,7 +73,7 @@ class Side:
         sample = (
             None
             if self.peer is None
-            else PeerSample(0, 1, self.peer.copy(), zero, zero, state, None, 0)
+            else PeerSample(0, 0, 1, self.peer.copy(), zero, zero, state, None, 0)
         )
         return self.supervisor.update(self.now_ns, self.presence, sample, self.own, **looks)
 

@@ -109,7 +109,7 @@ class End:
         sample = None
         if self.heard is not None and len(self.used) > self.delay:
             word, zero = self.used[0], np.zeros(1)
-            sample = PeerSample(0, 1, word.told_m, zero, zero, word.state, None, 0)
+            sample = PeerSample(0, 0, 1, word.told_m, zero, zero, word.state, None, 0)
         if self.state not in STOPPED:
             self.supervisor.update(
                 now_ns, self, sample, self.at, scale=self.scale, late=self.late, clutch=self.clutch

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from site_runtime.operator_requests import OperatorRequests
+from site_runtime.operator_requests import CLUTCH, EMERGENCY_STOP, RESET, OperatorRequests
 from site_runtime.terminal_keys import TerminalKeys
 
 ROOT = Path(__file__).parents[2]
@@ -23,7 +23,7 @@ DEADLINE_S = 20.0
 # It prints each request it sees, and ends at the word on its other pipe.
 PROGRAM = textwrap.dedent("""
     import os, select, sys, time
-    from site_runtime.operator_requests import OperatorRequests
+    from site_runtime.operator_requests import EMERGENCY_STOP, RESET, OperatorRequests
     from site_runtime.terminal_keys import TerminalKeys
 
     requests, clutch = OperatorRequests(), False
@@ -31,9 +31,10 @@ PROGRAM = textwrap.dedent("""
     with TerminalKeys(requests) as keys:
         print("listening" if keys.listening else "deaf", flush=True)
         while not select.select([orders], [], [], 0.01)[0]:
-            if requests.take_emergency_stop():
+            asked = requests.take()
+            if asked & EMERGENCY_STOP:
                 print("stop", flush=True)
-            if requests.take_reset():
+            if asked & RESET:
                 print("reset", flush=True)
             if requests.clutch is not clutch:
                 clutch = requests.clutch
@@ -203,6 +204,4 @@ def test_of_keys_read_together_none_is_lost_and_a_stop_outweighs_the_rest(
 ) -> None:
     requests = OperatorRequests()
     TerminalKeys(requests)._act(together)
-    assert requests.take_emergency_stop() is stop
-    assert requests.take_reset() is reset
-    assert requests.clutch is clutch
+    assert requests.take() == CLUTCH * clutch | EMERGENCY_STOP * stop | RESET * reset

@@ -105,7 +105,7 @@ def make_run(seconds: float = 12.0, dimension: int = 2, seed: int = 3) -> Run:
         row["link_distance_m"] = np.linalg.norm(x - (0.25, -0.1), axis=1) - 0.02
         row["midpoint_distance_m"] = row["link_distance_m"] + 0.01
         row["missed"] = np.where(t > 4.2, 3, 0)
-        row["rejected"] = np.where(t > 8.3, 2, 0)
+        row["rejected"][:, 4] = np.where(t > 8.3, 2, 0)
         rows[site] = row
     pressed = np.maximum(np.column_stack(hand(t - 0.12))[:, 0] - paths["remote"][:, 0], 0.0)
     rows["remote"]["external_force_n"][:, 0] = -200.0 * pressed

@@ -17,6 +17,11 @@ def rows_of(count: int, **fields: Any) -> RowArray:
     return rows
 
 
+def refused(count: int) -> list[int]:
+    """So many packets refused, for two reasons."""
+    return [count - 1, *([0] * 10), 1]
+
+
 def observe(log: EventLog, start_ms: int, rows: RowArray) -> list[Event]:
     return log.observe((start_ms + np.arange(len(rows))) * MS, rows)
 
@@ -41,9 +46,9 @@ def test_a_state_is_told_when_it_changes_and_at_first() -> None:
 
 def test_counters_tell_what_came_since_and_not_what_was_before() -> None:
     log = new_log()
-    first = observe(log, 0, rows_of(2, missed=40, rejected=2, lost=7, late=1))
+    first = observe(log, 0, rows_of(2, missed=40, rejected=refused(2), lost=7, late=1))
     assert [event.text for event in first] == ["local is OFFLINE"]
-    rows = rows_of(2, missed=[40, 43], rejected=[2, 3], lost=[8, 9], late=[1, 2])
+    rows = rows_of(2, missed=[40, 43], rejected=[refused(2), refused(3)], lost=[8, 9], late=[1, 2])
     assert observe(log, 2, rows) == [
         Event(3 * MS, "WARN", "local missed 3 ticks"),
         Event(3 * MS, "WARN", "local rejected 1 packets"),

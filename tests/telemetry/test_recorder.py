@@ -40,8 +40,9 @@ def options(folder: Path, **changes: object) -> RecorderOptions:
 
 
 def put(stream: TelemetryStream, rows: int, state: int = ENGAGED) -> None:
-    length = {"scalar": (), "joint": (2,), "task": (2,)}
+    length = {"scalar": (), "joint": (2,), "task": (2,), "reason": (12,)}
     for _ in range(rows):
+        stream.arrived([stream.count.to_bytes(8, "little"), b"second"])
         fields = {
             name: np.full(length[column.axis], stream.count % 250)
             for name, column in COLUMNS.items()
@@ -72,6 +73,13 @@ def assert_as_put(recording: Recording) -> None:
     rows = recording.rows
     assert (rows["sequence"] % 250 == rows["q"].T).all()
     assert (rows["missed"] == rows["sequence"] % 250).all()
+    arrivals = recording.arrivals
+    assert np.array_equal(arrivals["row"], np.repeat(rows["sequence"], 2))
+    assert np.array_equal(arrivals["number"] // 2, arrivals["row"])
+    first, second = arrivals[::2], arrivals[1::2]
+    assert np.array_equal(first["data"][:, :8].copy().view("<u8")[:, 0], rows["sequence"])
+    assert {second["data"].tobytes()} <= {len(second) * b"second".ljust(160, b"\0")}
+    assert set(first["length"]) | set(second["length"]) <= {8, 6}
 
 
 class Disk:

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rerun.chunk import McapReader
 
+from telemetry.piece import Piece
 from telemetry.recording import Gap, RecordingSource, RecordingWriter, read_recording
 from telemetry.ros_messages import decode_event, dtype_of, encode_event, encode_rows, row_schema
-from telemetry.row_ring import SiteEvent
+from telemetry.row_ring import ARRIVAL, SiteEvent
 from telemetry.rows import COLUMNS, RowArray, TelemetryError, row_dtype
 
 OFFSET_NS = 1_700_000_000_000_000_000
@@ -34,10 +35,21 @@ def some_rows(count: int, joints: int = 3, dimension: int = 2, first: int = 0) -
     return rows
 
 
+def arrivals_for(rows: RowArray) -> RowArray:
+    """Two datagrams of any bits for every row."""
+    arrivals = np.zeros(2 * len(rows), ARRIVAL)
+    arrivals["row"] = np.repeat(rows["sequence"], 2)
+    arrivals["number"] = 2 * arrivals["row"] + np.tile((0, 1), len(rows))
+    arrivals["length"] = 156
+    arrivals["data"] = np.random.default_rng(5).integers(0, 256, arrivals["data"].shape)
+    return arrivals
+
+
 def record(path: Path, rows: RowArray, chunk: int = 50, epoch: str = "9") -> Path:
     writer = RecordingWriter(path, source(rows["q"].shape[1], rows["position_m"].shape[1], epoch))
     for start in range(0, len(rows), chunk):
-        writer.write(rows[start : start + chunk], EVENTS if start == 0 else ())
+        part = rows[start : start + chunk]
+        writer.write(Piece(part, EVENTS if start == 0 else (), arrivals_for(part)))
         writer.flush()
     writer.close()
     return path
@@ -51,6 +63,8 @@ def test_rows_come_back_bit_by_bit(tmp_path: Path, joints: int, dimension: int) 
     assert back.rows.dtype == rows.dtype
     assert back.rows.tobytes() == rows.tobytes()
     assert back.events == EVENTS
+    parts = [arrivals_for(rows[start : start + 50]) for start in range(0, len(rows), 50)]
+    assert np.array_equal(back.arrivals, np.concatenate(parts))
     assert back.metadata["session"] == "demo"
     assert back.session_text == "format = 1\n# µ\n"
     assert back.complete
@@ -80,7 +94,7 @@ def test_the_schema_tells_every_unit_and_meaning_and_is_enough_to_read_by() -> N
     schema = row_schema(3, 2)
     for name, column in COLUMNS.items():
         assert re.search(
-            rf"^\w+(\[[23]\])? {name}  # \[{re.escape(column.unit)}\] {re.escape(column.meaning)}$",
+            rf"^\w+(\[\d+\])? {name}  # \[{re.escape(column.unit)}\] {re.escape(column.meaning)}$",
             schema,
             re.MULTILINE,
         ), name

@@ -124,7 +124,7 @@ def test_the_page_documents_exactly_the_columns() -> None:
         if match := re.fullmatch(r"\| (`.*) \| (.*) \| (.*) \|", line):
             names, unit, meaning = match.groups()
             documented[tuple(re.findall(r"`(\w+)`", names))] = (unit, meaning)
-    lengths = {"scalar": 1, "joint": 1, "task": 3}
+    lengths = {"scalar": 1, "joint": 1, "task": 3, "reason": 12}
     assert documented == {
         column_names(name, lengths[column.axis]): (column.unit, column.meaning)
         for name, column in COLUMNS.items()

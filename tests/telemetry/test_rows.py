@@ -8,7 +8,7 @@ from telemetry.rows import COLUMNS, TelemetryError, row_dtype
 def test_every_field_is_documented_and_has_its_length(joints: int, dimension: int) -> None:
     dtype = row_dtype(joints, dimension)
     assert dtype.names == tuple(COLUMNS)
-    lengths = {"scalar": (), "joint": (joints,), "task": (dimension,)}
+    lengths = {"scalar": (), "joint": (joints,), "task": (dimension,), "reason": (12,)}
     for name, column in COLUMNS.items():
         assert column.unit
         assert (

@@ -11,6 +11,7 @@ from telemetry.rows import (
     COLUMNS,
     LAYOUT_VERSION,
     NO_PEER_STATE,
+    REJECT_REASONS,
     RowArray,
     TelemetryError,
     row_dtype,
@@ -31,6 +32,8 @@ def fields_of(tick: int, joints: int = 3, dimension: int = 2) -> dict[str, Any]:
             value = tick * 64 + place
             fields[name] = value % 200 if column.format == "u1" else value
             fields[name] = fields[name] % 60000 if column.format == "<u2" else fields[name]
+        elif column.axis == "reason":
+            fields[name] = [tick + reason for reason in range(len(REJECT_REASONS))]
         else:
             length = joints if column.axis == "joint" else dimension
             fields[name] = tick + place / 64 + np.arange(length) / 1024
@@ -81,7 +84,7 @@ def test_without_a_peer_a_plain_nan_fills_its_position() -> None:
     assert row["peer_state"] == 255
 
 
-@pytest.mark.parametrize("counter", ["lost", "late", "rejected", "missed"])
+@pytest.mark.parametrize("counter", ["lost", "late", "missed", "sent_ns"])
 def test_a_counter_stays_at_the_most_it_holds(counter: str) -> None:
     """One forged packet can skip 2^64 sequence numbers; that must not stop the site."""
     stream = stream_to([])

@@ -3,8 +3,9 @@ import numpy as np
 from telemetry.rows import COLUMNS, row_dtype
 from telemetry.stream import RING_BATCHES, TelemetryStream, decode_batch
 
-CHANGED = {"sequence", "stamp_ns", "time_ns", "lateness_ns", "state"}
+CHANGED = {"sequence", "stamp_ns", "time_ns", "lateness_ns", "state", "requests"}
 OFF = {"cut", "torque_nm", "coupling_force_n", "force_share"}
+OFF |= {"read_ns", "step_ns", "write_ns", "sent_ns"}
 FAULT = 4
 
 
@@ -13,7 +14,7 @@ def stream_to(published: list[bytes], batch_rows: int = 5) -> TelemetryStream:
 
 
 def put_ones(stream: TelemetryStream) -> None:
-    length = {"scalar": (), "joint": (3,), "task": (2,)}
+    length = {"scalar": (), "joint": (3,), "task": (2,), "reason": (12,)}
     stream.put(
         **{
             name: np.ones(length[column.axis])
@@ -25,7 +26,7 @@ def put_ones(stream: TelemetryStream) -> None:
 
 def repeat(stream: TelemetryStream, tick: int) -> None:
     stream.repeat_stopped(
-        stamp_ns=100 + tick, time_ns=200 + tick, lateness_ns=300 + tick, state=FAULT
+        stamp_ns=100 + tick, time_ns=200 + tick, lateness_ns=300 + tick, state=FAULT, requests=8
     )
 
 
@@ -42,6 +43,28 @@ def test_the_newest_row_comes_again_with_the_outputs_off() -> None:
     times = [int(after[name]) for name in ("stamp_ns", "time_ns", "lateness_ns")]
     assert times == [100, 200, 300]
     assert after["state"] == FAULT
+    assert after["requests"] == 8
+
+
+def test_a_tick_that_failed_tells_how_far_it_came_and_what_it_read() -> None:
+    stream = stream_to([])
+    put_ones(stream)
+    stream.repeat_stopped(
+        stamp_ns=1,
+        time_ns=2,
+        lateness_ns=3,
+        state=FAULT,
+        requests=0,
+        read_ns=4,
+        step_ns=2**32,
+        reading=(np.full(3, 5.0), np.full(3, np.nan), np.full(2, 7.0)),
+    )
+    [row] = stream.last(1)
+    assert (row["read_ns"], row["step_ns"], row["write_ns"]) == (4, 2**32 - 1, 0)
+    assert row["q"].tolist() == [5.0] * 3
+    assert np.isnan(row["q_dot"]).all()
+    assert row["external_force_n"].tolist() == [7.0] * 2
+    assert (row["torque_nm"] == 0.0).all()
 
 
 def test_repeats_are_numbered_and_published_like_any_row_through_the_end_of_the_ring() -> None:
