@@ -21,7 +21,7 @@ from site_runtime.certification import certify, hold_of, site_gains
 from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of, damping_of, robot_of
 from site_runtime.session import Session
-from site_runtime.supervisor import DRIVEN, State
+from site_runtime.supervisor import DRIVEN, STOPPED, State
 from telemetry.energy import EnergyTrace
 from telemetry.rows import RowArray
 
@@ -92,7 +92,10 @@ class SessionEnergyMeter:
             zip(due.tolist(), measured[0][1], measured[1][1], strict=True)
         ):
             energy_j = self._functional_at(
-                int(times_ns[tick]), at_local, at_remote, _told_m(local, tick) - _told_m(remote, tick)
+                int(times_ns[tick]),
+                at_local,
+                at_remote,
+                _told_m(local, tick) - _told_m(remote, tick),
             )
             if _whole(local, tick) and _whole(remote, tick):
                 functional_j[i] = energy_j
@@ -156,17 +159,18 @@ class _SiteMeter:
                 zeta = self._reference(terms, float(engaged_s[tick]))
             motions.append(SiteMotion(terms.q_dot - zeta, terms.M, rows["velocity_m_s"][tick]))
             zetas.append((int(times_ns[tick]), zeta))
-        s = rows["q_dot"]
+        s = np.array(rows["q_dot"], np.float64)
         if self._reference is not None and zetas:
             self._zeta = zetas[-1]
-            at_ns = [at for at, _ in zetas]
-            s = s - np.column_stack(
-                [np.interp(times_ns, at_ns, joint) for joint in np.array([z for _, z in zetas]).T]
-            )
+            at_ns, at = [at_ns for at_ns, _ in zetas], np.array([zeta for _, zeta in zetas])
+            for joint in range(s.shape[1]):
+                s[:, joint] -= np.interp(times_ns, at_ns, at[:, joint])
         X_dot = rows["velocity_m_s"]
+        # A stopped site repeats its last row: what moves in there moves no more.
+        alive = ~np.isin(rows["state"], list(STOPPED))
         injected_w = np.einsum("kz,kz->k", rows["external_force_n"], X_dot)
         dissipated_w = np.square(s) @ self._damping.joint + np.square(X_dot) @ self._damping.task
-        return np.column_stack((injected_w, driven * dissipated_w)), motions
+        return np.column_stack((alive * injected_w, driven * dissipated_w)), motions
 
     def _engaged_s(
         self, times_ns: IntArray, rows: RowArray, driven: npt.NDArray[np.bool_]
@@ -180,7 +184,7 @@ class _SiteMeter:
         since_ns = np.where(starts, times_ns, self._engaged_ns)
         since_ns = np.maximum.accumulate(since_ns)
         self._driven, self._engaged_ns = bool(driven[-1]), int(since_ns[-1])
-        engaged_s: FloatArray = (times_ns - since_ns) * 1e-9
+        engaged_s: FloatArray = (times_ns - since_ns).astype(np.float64) * 1e-9
         return engaged_s
 
 
@@ -213,9 +217,7 @@ def functional_rules(session: Session) -> FunctionalRules:
     coupling, hold_s = coupling_of(session.coupling), hold_of(session)
     gains = [site_gains(session, site) for site in SiteId]
     relaxation = (
-        relaxation_theorem_b
-        if certification.best.theorem is Theorem.B
-        else relaxation_theorem_a
+        relaxation_theorem_b if certification.best.theorem is Theorem.B else relaxation_theorem_a
     )
     local_s, remote_s = (relaxation(coupling, site) for site in gains)
     axis = int(round_trip(local_s, remote_s, hold_s).argmin())
@@ -230,4 +232,4 @@ def _told_m(rows: RowArray, tick: int) -> FloatArray:
 
 
 def _whole(rows: RowArray, tick: int) -> bool:
-    return rows["state"][tick] == State.ENGAGED and rows["force_share"][tick] == 1.0
+    return bool(rows["state"][tick] == State.ENGAGED and rows["force_share"][tick] == 1.0)

@@ -100,21 +100,16 @@ class _Arm:
         strips, points, arrows = self._shapes
         ghost = blend(peer.colour, BACKGROUND, 0.55)
         pale = blend(view.colour, WHITE, 0.5)
-        name = {"colors": ghost, "radii": 0.4 * width, "labels": f"{peer.name} (delayed)"}
         log("ghost", strips, 10, {"colors": ghost, "radii": 0.7 * width})
-        log("ghost_name", points, 11, name)
         trail = blend(view.colour, BACKGROUND, 0.3)
         log("trail", strips, 15, {"colors": trail, "radii": 0.25 * width})
         log("arm", strips, 20, {"colors": view.colour, "radii": line})
         log("joints", points, 30, {"colors": WHITE, "radii": 1.4 * line})
-        log("coupling_force", arrows, 40, {"colors": pale, "radii": 0.4 * width})
-        log("external_force", arrows, 41, {"colors": RED, "radii": 0.4 * width})
+        log("forces", arrows, 40, {"colors": [pale, RED], "radii": 0.4 * width})
         base = {"positions": self._picture.place(home(view)), "colors": GREY, "radii": 2.4 * line}
         log("base", points, 25, base)
 
-    def draw(
-        self, peer: "_Arm", times_ns: IntArray, rows: RowArray, points_m: FloatArray
-    ) -> None:
+    def draw(self, peer: "_Arm", times_ns: IntArray, rows: RowArray, points_m: FloatArray) -> None:
         place = self._picture.place
         strips, points, arrows = self._shapes
 
@@ -131,12 +126,16 @@ class _Arm:
         trails = [place(trail_m[max(end - TRAIL_FRAMES, 0) : end]) for end in ends]
         send("trail", strips.columns(strips=trails))
         self._trail_m = trail_m[-TRAIL_FRAMES:]
-        for path in ("external_force", "coupling_force"):
-            vectors = self._picture.arrows(rows[f"{path}_n"])
-            send(path, arrows.columns(origins=place(tips_m), vectors=vectors))
+        vectors = np.stack(
+            [self._picture.arrows(rows[f"{name}_force_n"]) for name in ("coupling", "external")],
+            axis=1,
+        )
+        both = arrows.columns(
+            origins=np.repeat(place(tips_m), 2, axis=0), vectors=np.concatenate(list(vectors))
+        )
+        send("forces", both.partition([2] * len(rows)))
         lengths, ghosts = self._ghosts(peer, times_ns, rows["one_way_delay_s"])
         send("ghost", strips.columns(strips=list(ghosts)).partition(lengths))
-        send("ghost_name", points.columns(positions=ghosts[:, 1]).partition(lengths))
         if self._mesh is not None:
             self._mesh.draw(times_ns, rows["q"])
 

@@ -20,35 +20,39 @@ def blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
     time_axis = rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end), zoom_lock=True)
 
     def plot(
-        path: str, name: str, range_: tuple[float, float] | None = None
+        path: str,
+        name: str,
+        range_: tuple[float, float] | None = None,
+        *,
+        legend: bool = False,
     ) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             origin=f"/{path}",
             name=name,
             axis_x=time_axis,
             axis_y=None if range_ is None else rrb.ScalarAxis(range=range_, zoom_lock=True),
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+            # A legend hides what is behind it: on the first page, titles say what is what.
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
             time_ranges=[time_range],
         )
 
     tabs = [
         _events(),
-        plot("torque", "Joint torque [N·m]"),
-        plot("angle", "Joint angles [rad]"),
-        plot("speed", "Joint speeds [rad/s]"),
-        plot("round_trip", "Greatest loop age [ms]"),
+        plot("torque", "Torques [N·m]", legend=True),
+        plot("angle", "Angles [rad]", legend=True),
+        plot("speed", "Speeds [rad/s]", legend=True),
+        plot("round_trip", "Loop age [ms]", legend=True),
     ]
     if picture.scene.obstacles:
-        tabs.append(plot("clearance", "Clearance [mm]"))
-    force_n = picture.full_scale_force_n
+        tabs.append(plot("clearance", "Clearance [mm]", legend=True))
     middle = [
-        plot("error", "Position error [mm]"),
-        plot("force", "Force [N]"),
+        plot("error", "Position error [mm] · white: between the points"),
+        plot("force", "Force [N] · pale: of the coupling"),
     ]
     if picture.meter is not None:
         middle += [
-            plot("energy", "Energy of the proof [J], must not rise in free motion"),
-            plot("work", "Energy put in and taken out [J]"),
+            plot("energy", "Energy of the proof [J] · thin: its parts"),
+            plot("work", "Energy put in [J] · pale: taken out by damping"),
         ]
     right = [
         plot("margin", "Margin of the certificate [ms]", _margin_range(picture)),
@@ -58,11 +62,11 @@ def blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                rrb.TextDocumentView(origin="/certificate", name="Certificate"),
+                rrb.TextDocumentView(origin="/certificate", name="Certificate", titlebar=False),
                 rrb.Horizontal(*(_arm(picture, extent, view) for view in picture.sites)),
                 rrb.StateTimelineView(origin="/state", name="Supervisor", time_view=time_axis),
                 rrb.Tabs(*tabs, active_tab=0),
-                row_shares=[1.2, 5, 1.4, 2.2],
+                row_shares=[1.3, 5, 1.4, 2.2],
             ),
             rrb.Vertical(*middle),
             rrb.Vertical(*right),
@@ -77,12 +81,13 @@ def blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
 
 
 def _arm(picture: Picture, extent: Extent, view: SiteView) -> rrb.View:
-    name = f"{view.name.capitalize()} · {view.joints} joints"
+    (peer,) = (other.name for other in picture.sites if other is not view)
+    name = f"{view.name.capitalize()} · {view.joints} joints · dim: {peer} as received"
     contents = ["/scene/world/**", f"/scene/{view.name}/**", f"/mesh_{view.name}/**"]
     low, high = extent.low, extent.high
     if picture.spatial:
         center = (low + high) / 2
-        eye = center + picture.reach_m * np.array([-0.5, -1.3, 0.8])
+        eye = center + picture.reach_m * np.array([-0.4, -1.0, 0.6])
         return rrb.Spatial3DView(
             contents=contents,
             name=name,

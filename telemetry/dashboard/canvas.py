@@ -29,9 +29,7 @@ class Canvas:
         self._recording.set_sinks(sink, default_blueprint=blueprint)
         self._column: tuple[IntArray, rr.TimeColumn] | None = None
 
-    def send(
-        self, path: str, times_ns: IntArray, columns: Iterable[rr.ComponentColumn]
-    ) -> None:
+    def send(self, path: str, times_ns: IntArray, columns: Iterable[rr.ComponentColumn]) -> None:
         """Draw a column of things at these times (k,)."""
         # Many columns share their times, and a time column costs as much as what it indexes.
         if self._column is None or self._column[0] is not times_ns:

@@ -54,18 +54,18 @@ def _verdict(picture: Picture, rows: list[RowArray]) -> str:
     certified_s = min((float(row["certified_round_trip_s"]) for row in rows), default=inf)
     loops_s = [float(row["loop_bound_s"]) for row in rows]
     known_s = [loop_s for loop_s in loops_s if isfinite(loop_s)]
-    theorem = "" if picture.certificate is None else f" by {picture.certificate.theorem}"
+    theorem = "" if picture.certificate is None else f" ({picture.certificate.theorem})"
     if certified_s <= 0.0:
         return "**NOT CERTIFIED** for any round trip"
-    limit = f"{certified_s * 1e3:.0f} ms certified{theorem}" if isfinite(certified_s) else ""
+    limit = f"{certified_s * 1e3:.0f} ms{theorem}" if isfinite(certified_s) else ""
     if not known_s:
-        return f"**NO LOOP** yet · {limit}"
+        return f"**NO LOOP** yet{limit and f' · certified up to {limit}'}"
     loop_s = max(known_s)
     if not limit:
         return f"loop **{loop_s * 1e3:.0f} ms**"
     margin_ms = (certified_s - loop_s) * 1e3
     verdict = "CERTIFIED" if margin_ms >= 0.0 else "BEYOND THE CERTIFICATE"
-    return f"**{verdict}** margin `{margin_ms:+.0f} ms` · loop **{loop_s * 1e3:.0f}** of {limit}"
+    return f"**{verdict}** margin **{margin_ms:+.0f} ms** · loop **{loop_s * 1e3:.0f}** of {limit}"
 
 
 def _state(picture: Picture, row: RowArray) -> str:

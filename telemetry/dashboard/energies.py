@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from telemetry.dashboard.canvas import Canvas
+from telemetry.dashboard.signals import CALM_NS
 from telemetry.dashboard.styles import Policy, series
 from telemetry.energy import EnergyMeter
 from telemetry.picture import WHITE, Picture, blend
@@ -15,7 +16,11 @@ IntArray = npt.NDArray[np.int64]
 
 STEP_NS: Final = 1_000_000
 SILENT_NS: Final = 100_000_000
-_PARTS: Final = {"kinetic": (160, 200, 120), "coupling": (200, 130, 200), "in transit": (90, 190, 190)}
+_PARTS: Final = {
+    "kinetic": (160, 200, 120),
+    "coupling": (200, 130, 200),
+    "in transit": (90, 190, 190),
+}
 
 
 class Energies:
@@ -37,16 +42,20 @@ class Energies:
         series(canvas, "energy/parts", list(_PARTS), list(_PARTS.values()))
         for view, by in zip(picture.sites, ("hand", "environment"), strict=True):
             names = [f"put in by the {by}", f"taken by {view.name} damping"]
-            series(canvas, f"work/{view.name}", names, [view.colour, blend(view.colour, WHITE, 0.6)])
+            series(
+                canvas, f"work/{view.name}", names, [view.colour, blend(view.colour, WHITE, 0.6)]
+            )
 
-    def draw(self, until_ns: int) -> None:
-        """Draw up to this time [ns], as far as both sites have been heard."""
+    def draw(self, until_ns: int, *, everything: bool) -> None:
+        """Draw up to this time [ns], as far as both sites have been heard; maybe later."""
         if not all(len(track.rows) for track in self._tracks):
             return
         until_ns = min(until_ns, *(track.newest_ns or 0 for track in self._tracks))
         first_ns = max(int(track.times_ns[0]) for track in self._tracks)
         if self._until_ns is not None:
             first_ns = max(first_ns, self._until_ns + STEP_NS)
+            if not everything and until_ns - first_ns < 0.95 * CALM_NS:
+                return
         times_ns = np.arange(-(-first_ns // STEP_NS) * STEP_NS, until_ns + 1, STEP_NS)
         if not len(times_ns):
             return

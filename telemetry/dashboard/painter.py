@@ -12,7 +12,7 @@ from telemetry.dashboard.canvas import Canvas
 from telemetry.dashboard.certificate import CertificatePanel
 from telemetry.dashboard.energies import Energies
 from telemetry.dashboard.scene import draw_scene
-from telemetry.dashboard.signals import CommonSignals, Signals, draw_event
+from telemetry.dashboard.signals import Signals, common_style, draw_event, plot_apart
 from telemetry.picture import Extent, Picture
 from telemetry.rows import TelemetryError
 from telemetry.stream import Batch
@@ -36,10 +36,10 @@ class Painter:
         self._canvas = canvas = Canvas(sink, blueprint(picture, self._extent))
         draw_scene(canvas, picture)
         self._signals = (
-            Signals(canvas, picture, local, remote),
-            Signals(canvas, picture, remote, local),
+            Signals(canvas, picture, local, remote, limits=True),
+            Signals(canvas, picture, remote, local, limits=False),
         )
-        self._common = CommonSignals(canvas)
+        common_style(canvas)
         self._arms = Arms(canvas, picture, self._extent, tracks)
         self._certificate = CertificatePanel(canvas, picture)
         self._energies = (
@@ -74,18 +74,15 @@ class Painter:
             until_ns = min(newest)
         for track, signals in zip(self._tracks, self._signals, strict=True):
             times_ns, rows = track.take(until_ns)
-            if not len(rows):
-                continue
-            signals.draw(times_ns, rows)
-            if track is self._local:
+            signals.draw(times_ns, rows, everything=everything)
+            if track is self._local and len(rows):
                 told_m = rows["position_m"] - rows["offset_m"]
-                apart_m = np.full(len(rows), np.nan)
                 if len(self._remote.rows):
                     apart_m = np.linalg.norm(told_m - self._remote.told_at(times_ns), axis=1)
-                self._common.draw(times_ns, rows, apart_m)
+                    plot_apart(self._canvas, times_ns, apart_m)
         self._certificate.draw(until_ns, tuple(track.row_at(until_ns) for track in self._tracks))
         if self._energies is not None:
-            self._energies.draw(until_ns)
+            self._energies.draw(until_ns, everything=everything)
         if self._arms.draw(until_ns):
             self._canvas.show(blueprint(self._picture, self._extent))
         for track in self._tracks:

@@ -16,44 +16,66 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 RESTATE_NS: Final = 5_000_000_000
+CALM_NS: Final = 100_000_000
+"""What nobody steers by is drawn this seldom: cost goes by the piece, not by the row."""
 
 
 class Signals:
-    """Draws one site's rows."""
+    """Draws one site's rows; one of the sites, with the `limits` that both share."""
 
-    def __init__(self, canvas: Canvas, picture: Picture, view: SiteView, peer: SiteView) -> None:
+    def __init__(
+        self, canvas: Canvas, picture: Picture, view: SiteView, peer: SiteView, *, limits: bool
+    ) -> None:
+        self._limits = limits
         self._canvas = canvas
         self._picture = picture
         self._name = view.name
         self._events = EventLog(view.name, picture.state_names, picture.cut_names)
         self._state: int | None = None
         self._stated_ns = 0
+        self._calm: list[tuple[IntArray, RowArray]] = []
         state_style(canvas, f"state/{view.name}", picture.state_names)
         self._log_style(view, peer)
 
-    def draw(self, times_ns: IntArray, rows: RowArray) -> None:
-        """Draw rows (k,) at these times (k,) [ns]."""
+    def draw(self, times_ns: IntArray, rows: RowArray, *, everything: bool) -> None:
+        """Draw rows (k,) at these times (k,) [ns]; of some signals later, unless everything."""
+        if len(rows):
+            self._draw_states(times_ns, rows)
+            self._draw_at_once(times_ns, rows)
+            self._calm.append((times_ns.copy(), rows.copy()))
+            for time_ns, level, text in self._events.observe(times_ns, rows):
+                draw_event(self._canvas, time_ns, level, text)
+        if self._calm:
+            since_ns = int(self._calm[-1][0][-1] - self._calm[0][0][0])
+            if everything or since_ns >= 0.95 * CALM_NS:
+                self._draw_calmly(*map(np.concatenate, zip(*self._calm, strict=True)))
+                self._calm.clear()
 
+    def _draw_at_once(self, times_ns: IntArray, rows: RowArray) -> None:
         def plot(path: str, *signals: FloatArray) -> None:
             self._canvas.plot(f"{path}/{self._name}", times_ns, *signals)
 
         plot("error", np.linalg.norm(rows["position_m"] - rows["peer_position_m"], axis=1) * 1e3)
         external_n = np.linalg.norm(rows["external_force_n"], axis=1)
         plot("force", external_n, np.linalg.norm(rows["coupling_force_n"], axis=1))
-        plot("torque", rows["torque_nm"])
-        plot("delay", rows["one_way_delay_s"] * 1e3)
-        plot("round_trip", rows["loop_bound_s"] * 1e3)
-        plot("lateness", rows["lateness_ns"] * 1e-3)
-        plot("angle", rows["q"])
-        plot("speed", rows["q_dot"])
         certified_s = rows["certified_round_trip_s"]
         if np.isfinite(certified_s).any():
             plot("margin", (certified_s - rows["loop_bound_s"]) * 1e3)
+
+    def _draw_calmly(self, times_ns: IntArray, rows: RowArray) -> None:
+        def plot(path: str, *signals: FloatArray) -> None:
+            self._canvas.plot(f"{path}/{self._name}", times_ns, *signals)
+
+        plot("delay", rows["one_way_delay_s"] * 1e3)
+        plot("lateness", rows["lateness_ns"] * 1e-3)
+        plot("torque", rows["torque_nm"])
+        plot("angle", rows["q"])
+        plot("speed", rows["q_dot"])
+        plot("round_trip", rows["loop_bound_s"] * 1e3)
+        if self._limits:
+            _plot_limits(self._canvas, times_ns, rows["certified_round_trip_s"])
         if self._picture.scene.obstacles:
             plot("clearance", rows["link_distance_m"] * 1e3)
-        self._draw_states(times_ns, rows)
-        for time_ns, level, text in self._events.observe(times_ns, rows):
-            draw_event(self._canvas, time_ns, level, text)
 
     def _draw_states(self, times_ns: IntArray, rows: RowArray) -> None:
         for time_ns, state in zip(times_ns.tolist(), rows["state"].tolist(), strict=True):
@@ -89,28 +111,29 @@ class Signals:
         style("clearance", [f"{name} links"], [own], Policy.Min)
 
 
-class CommonSignals:
-    """Draws what both sites' rows tell together, and the limits."""
+def common_style(canvas: Canvas) -> None:
+    """Style what both sites' rows tell together."""
+    series(canvas, "error/apart", ["|local − remote|"], [WHITE])
+    series(canvas, "round_trip/certified", ["certified"], [RED])
+    series(canvas, "margin/limit", ["limit"], [RED])
 
-    def __init__(self, canvas: Canvas) -> None:
-        self._canvas = canvas
-        series(canvas, "error/apart", ["|local − remote|"], [WHITE])
-        series(canvas, "round_trip/certified", ["certified"], [RED])
-        series(canvas, "margin/limit", ["limit"], [RED])
 
-    def draw(self, times_ns: IntArray, local: RowArray, apart_m: FloatArray) -> None:
-        """Draw at the local rows (k,) the limits and how far apart the points are (k,) [m]."""
-        certified_s = local["certified_round_trip_s"]
-        self._plot_finite("round_trip/certified", times_ns, certified_s * 1e3)
-        self._plot_finite("margin/limit", times_ns, np.where(np.isfinite(certified_s), 0.0, np.nan))
-        self._plot_finite("error/apart", times_ns, apart_m * 1e3)
+def plot_apart(canvas: Canvas, times_ns: IntArray, apart_m: FloatArray) -> None:
+    """Draw how far apart the robots' points are (k,) [m]; NaN where it is not known."""
+    _plot_finite(canvas, "error/apart", times_ns, apart_m * 1e3)
 
-    def _plot_finite(self, path: str, times_ns: IntArray, values: FloatArray) -> None:
-        finite = np.isfinite(values)
-        if finite.all():
-            self._canvas.plot(path, times_ns, values)
-        elif finite.any():
-            self._canvas.plot(path, times_ns[finite], values[finite])
+
+def _plot_limits(canvas: Canvas, times_ns: IntArray, certified_s: FloatArray) -> None:
+    _plot_finite(canvas, "round_trip/certified", times_ns, certified_s * 1e3)
+    _plot_finite(canvas, "margin/limit", times_ns, np.where(np.isfinite(certified_s), 0.0, np.nan))
+
+
+def _plot_finite(canvas: Canvas, path: str, times_ns: IntArray, values: FloatArray) -> None:
+    finite = np.isfinite(values)
+    if finite.all():
+        canvas.plot(path, times_ns, values)
+    elif finite.any():
+        canvas.plot(path, times_ns[finite], values[finite])
 
 
 def draw_event(canvas: Canvas, time_ns: int, level: str, text: str) -> None:

@@ -17,9 +17,7 @@ import rerun as rr
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from telemetry import dashboard
 from telemetry.dashboard import (
-    FRAME_NS,
     Arrival,
     Dashboard,
     LiveServer,
@@ -27,11 +25,13 @@ from telemetry.dashboard import (
     RecordingFile,
     ViewerCrashError,
     draw,
+    free_port,
     headless_viewer,
     save_recording,
     screenshot,
     start_viewer,
 )
+from telemetry.dashboard.arms import FRAME_NS
 from telemetry.picture import (
     LOCAL_COLOUR,
     RED,
@@ -414,12 +414,12 @@ def test_live_pages_are_served_on_loopback_only(
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    live = LiveServer(dashboard._free_port())
+    live = LiveServer(free_port())
     shown = Dashboard(picture_of(chain), [live])
     wait_for(lambda: ("127.0.0.1", live.port) in listening(psutil.Process()))
     with pytest.raises(TelemetryError, match=str(live.port)):
         Dashboard(picture_of(chain), [live])
-    web_port = dashboard._free_port()
+    web_port = free_port()
     viewer = start_viewer(live, web_port)
     try:
         assert str(live.port) in viewer.address
