@@ -8,7 +8,12 @@ from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.export import export
 from farhand.info import info
+from farhand.plot import plot
+from farhand.recompute import recompute
+from farhand.record import record
+from farhand.replay import replay
 from farhand.reproduce import reproduce
 from farhand.simulate import simulate
 from local_site.daemon import local
@@ -27,7 +32,12 @@ for command in (
     dashboard,
     demo,
     simulate,
+    record,
     info,
+    replay,
+    recompute,
+    plot,
+    export,
     certify,
     design,
     reproduce,

@@ -14,8 +14,9 @@ from rich.text import Text
 
 from farhand.console import OUT, user_errors
 from site_runtime.guard import Cut, cut_names
-from telemetry.recording import Recording, read_recording
-from telemetry.rows import RowArray, TelemetryError
+from telemetry.recorded_runs import recorded_runs, recording_files
+from telemetry.recording import Recording
+from telemetry.rows import RowArray
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,28 +31,8 @@ def info(
 ) -> None:
     """Tell what recordings hold: duration, states, gaps, events, loop age, lateness, packets."""
     with user_errors():
-        for run in _runs(_files(paths)):
+        for run in recorded_runs(recording_files(paths)):
             OUT.print(_table(run))
-
-
-def _files(paths: list[Path]) -> list[Path]:
-    files: list[Path] = []
-    for path in paths:
-        found = sorted(path.rglob("rows-*.mcap")) if path.is_dir() else [path]
-        if not found:
-            raise TelemetryError(f"{path}: there is no recording (rows-*.mcap) in this folder")
-        files += found
-    return files
-
-
-def _runs(files: list[Path]) -> list[Recording]:
-    """Join the segments of each run of each site, in the order of their first rows."""
-    segments: dict[tuple[str, str], list[Path]] = {}
-    for file in files:
-        for site, recording in read_recording(file).items():
-            segments.setdefault((site, recording.metadata["epoch"]), []).append(file)
-    runs = [read_recording(*paths)[site] for (site, _), paths in segments.items()]
-    return sorted((run for run in runs if len(run.rows)), key=lambda run: int(run.wall_times_ns[0]))
 
 
 def _table(run: Recording) -> Table:

@@ -38,7 +38,7 @@ class Surroundings:
     Session time is zero at `session_start_ns` on its clock; `epoch` names this run and differs
     from every other; `publish` takes telemetry and must not block; `shared_clock` says that both
     sites read one clock; `requests` are those of this site's operator; `allocate` gives the memory
-    that telemetry rows are kept in.
+    that telemetry rows are kept in; `in_place_of` may put another device in the session's place.
     """
 
     link: Link
@@ -49,6 +49,7 @@ class Surroundings:
     shared_clock: bool = False
     requests: OperatorRequests = field(default_factory=OperatorRequests)
     allocate: Callable[[int], Memory] = bytearray
+    in_place_of: Callable[[Device], Device] = lambda device: device
 
 
 def device_of(settings: LocalSettings | RemoteSettings, context: DeviceContext) -> Device:
@@ -88,7 +89,7 @@ def assemble(
     robot = robot_of(session, identity)
     n, z = robot.joints, robot.task_dimension
     context = DeviceContext(robot, contact, clock.now_ns, start_ns, 2 * session.seed + identity)
-    device = device_of(own, context)
+    device = surroundings.in_place_of(device_of(own, context))
     telemetry = TelemetryStream(
         n,
         z,

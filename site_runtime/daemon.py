@@ -17,15 +17,18 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
 from site_runtime.clock import SteadyClock
+from site_runtime.daemon_log import DaemonLog, LogFormat
 from site_runtime.flight_recorder import start_recorder
 from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
-from site_runtime.real_time import RealTimeError, RealTimeReport, apply_real_time
+from site_runtime.real_time import RealTimeError, apply_real_time
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
+from site_runtime.site_events import Companion, SiteEvents
 from site_runtime.status import StatusLine, summary
 from site_runtime.terminal_keys import HELP, TerminalKeys
-from telemetry.recorder_process import RecorderProcess, SharedMemory
+from telemetry.companion import SharedMemory
 from telemetry.rows import TelemetryError
 
 SessionPath: TypeAlias = Annotated[
@@ -46,10 +49,24 @@ Duration: TypeAlias = Annotated[
     float | None, typer.Option("--duration", help="Stop after so many seconds.", min=0.001)
 ]
 Quiet: TypeAlias = Annotated[
-    bool, typer.Option("--quiet", help="No live status line; the summary still comes.")
+    bool,
+    typer.Option("--quiet", help="No live status line, no events; the summary still comes."),
 ]
 NoRecord: TypeAlias = Annotated[
     bool, typer.Option("--no-record", help="No flight recorder: nothing is written to the disk.")
+]
+Metrics: TypeAlias = Annotated[
+    MetricsAddress | None,
+    typer.Option(
+        "--metrics",
+        metavar="[HOST:]PORT",
+        parser=metrics_address,
+        help="Serve Prometheus metrics there; on loopback unless a host is given, port 0 is any.",
+    ),
+]
+Log: TypeAlias = Annotated[
+    LogFormat,
+    typer.Option("--log", help="json: one JSON object a line on stderr, and nothing else."),
 ]
 
 # Ctrl-C, a service manager, a terminal or a login that is lost
@@ -70,6 +87,8 @@ class DaemonOptions:
     duration_s: float | None
     quiet: bool
     record: bool
+    metrics: MetricsAddress | None
+    log: LogFormat
 
 
 def site_command(
@@ -84,6 +103,8 @@ def site_command(
         duration: Duration = None,
         quiet: Quiet = False,
         no_record: NoRecord = False,
+        metrics: Metrics = None,
+        log: Log = LogFormat.TEXT,
     ) -> None:
         options = DaemonOptions(
             None if connect is None else tuple(connect),
@@ -91,6 +112,8 @@ def site_command(
             duration,
             quiet,
             not no_record,
+            metrics,
+            log,
         )
         raise typer.Exit(run_daemon(identity, build, session, options))
 
@@ -109,11 +132,12 @@ def run_daemon(
 
     0 after a clean end, 1 after a fault, 2 if it could not start.
     """
-    console = Console(stderr=True)
+    log = DaemonLog(identity.label, options.log)
     try:
         session = load_session(session_path)
         clock = SteadyClock()
         requests = OperatorRequests()
+        shares_rows = options.record or options.metrics is not None
         with (
             closing(_node(session, identity, options)) as node,
             closing(SharedMemory()) as memory,
@@ -127,31 +151,61 @@ def run_daemon(
                 epoch=time.time_ns(),
                 publish=node.publisher(telemetry_key(session.name, identity)),
                 requests=requests,
-                allocate=memory.allocate if options.record else bytearray,
+                allocate=memory.allocate if shares_rows else bytearray,
             )
+            log.about(session.name, surroundings.epoch)
             site = build(session, surroundings)
-            _greet(console, session, site)
+            log.say(_greeting(session, site))
             cpus = session.real_time
             cpu = cpus.local_cpu if identity is SiteId.LOCAL else cpus.remote_cpu
             with (
                 StopSignals(clock, options.duration_s, requests) as signals,
                 TerminalKeys(requests) as keys,
+                # before the recorder, to which a start that fails now were a site that died
+                nullcontext()
+                if options.metrics is None
+                else start_metrics(
+                    session, site, memory, options.metrics, recorded=options.record
+                ) as metrics,
                 start_recorder(session, site, memory)
                 if options.record
                 else nullcontext() as recorder,
-                StatusLine(site, recorder, quiet=options.quiet),
+                _status(site, (recorder, metrics), log, options),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
-                _report(console, real_time, recorder)
+                if recorder is not None:
+                    log.say(f"recording in {recorder.folder}")
+                if metrics is not None:
+                    log.say(f"metrics at {metrics.url}")
+                for refusal in real_time.refused:
+                    log.say(f"real time: {refusal}", "WARN")
                 if keys.listening and not options.quiet:
-                    console.print(HELP, highlight=False)
+                    log.say(HELP)
                 site.run(signals.asked_to_stop)
                 site.telemetry.farewell(clock.now_ns())
-            summary(site, Console(), recorder)
+            if log.format is LogFormat.TEXT:
+                summary(site, Console(), recorder)
+            elif recorder is not None and recorder.trouble is not None:
+                log.say(recorder.trouble, "WARN")
     except (SessionError, LinkError, HardwareError, RealTimeError, TelemetryError) as error:
-        console.print(f"{identity.label} site: {error}", style="red", highlight=False, markup=False)
+        log.say(f"{identity.label} site: {error}", "ERROR")
         return EXIT_NOT_STARTED
     return EXIT_FAULT if site.failure is not None else 0
+
+
+def _status(
+    site: Site,
+    companions: tuple[Companion | None, ...],
+    log: DaemonLog,
+    options: DaemonOptions,
+) -> StatusLine:
+    """Return what tells people, or programs, how the site is while it runs."""
+    text = log.format is LogFormat.TEXT
+    running = tuple(companion for companion in companions if companion is not None)
+    told = not (text and options.quiet)
+    wall_offset_ns = time.time_ns() - SteadyClock().now_ns()
+    events = SiteEvents(site, running, log, wall_offset_ns) if told else None
+    return StatusLine(site, running, events, live=text and not options.quiet)
 
 
 def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNode:
@@ -217,19 +271,9 @@ class StopSignals:
         self._asked = True
 
 
-def _greet(console: Console, session: Session, site: Site) -> None:
-    console.print(
-        f"[bold]farhand[/bold] {site.identity.label} site · session {session.name} "
+def _greeting(session: Session, site: Site) -> str:
+    return (
+        f"farhand {site.identity.label} site · session {session.name} "
         f"({session.digest:016x}) · {session.loop.rate_hz} Hz · certified round trip "
-        f"{site.margin.certified_s * 1e3:.0f} ms",
-        highlight=False,
+        f"{site.margin.certified_s * 1e3:.0f} ms"
     )
-
-
-def _report(console: Console, real_time: RealTimeReport, recorder: RecorderProcess | None) -> None:
-    if recorder is not None:
-        console.print(
-            f"recording in {recorder.folder}", highlight=False, markup=False, soft_wrap=True
-        )
-    for refusal in real_time.refused:
-        console.print(f"[yellow]real time:[/yellow] {refusal}", highlight=False)

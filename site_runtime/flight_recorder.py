@@ -8,8 +8,9 @@ from site_runtime.clock import SteadyClock
 from site_runtime.session import Session
 from site_runtime.site import Site
 from site_runtime.supervisor import State
+from telemetry.companion import SharedMemory
 from telemetry.recorder import RecorderOptions
-from telemetry.recorder_process import RecorderProcess, SharedMemory
+from telemetry.recorder_process import RecorderProcess
 
 INCIDENT_STATES = ("FAULT", "EMERGENCY_STOP")
 """Entering one of these is an incident: the rows around it are never deleted."""

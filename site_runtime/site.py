@@ -162,26 +162,34 @@ class Site:
             peer = self.channel.latest(now_ns)
             terms = self._robot.terms(reading.position_rad, reading.velocity_rad_s)
             state = self._supervise(now_ns, lateness_ns, peer, terms, asked)
-            command, torque_nm, share = self._idle, None, 0.0
+            command, share, engaged_s = self._idle, 0.0, nan
             if state in DRIVEN and self._supervisor.target_m is not None:
-                target_m = self.guard.target(self._supervisor.target_m)
                 share = self._supervisor.force_share(now_ns)
                 engaged_s = self._supervisor.engaged_s(now_ns)
-                command = self._controller.step(terms, target_m, share, engaged_s)
-                torque_nm = self.guard.torque(command.torque_nm, terms)
+                command = self.command(terms, self._supervisor.target_m, share, engaged_s)
                 self._passed(_STEP, now_ns)
-                self._device.write(torque_nm)
+                self._device.write(command.torque_nm)
                 self._passed(_WRITE, now_ns)
             force_n = reading.wrench[: self._robot.task_dimension]
             self._told_m = self._supervisor.told_m(terms.X)
             if self.channel.send(now_ns, state, self._told_m, terms.X_dot, force_n):
                 self._passed(_SENT, now_ns)
-            self._put(now_ns, lateness_ns, asked, reading, peer, terms, command, torque_nm, share)
+            self._put(now_ns, lateness_ns, asked, reading, peer, terms, command, share, engaged_s)
         except Exception as failure:
             self._fail(now_ns, failure)
             self._put_failed(now_ns, lateness_ns, asked, reading)
         self.ticks += 1
         self._duration_ns = self._clock.now_ns() - now_ns
+
+    def command(
+        self, terms: RobotTerms, target_m: FloatArray, share: float, engaged_s: float
+    ) -> Command:
+        """Return what the guard leaves of the controller's command toward a point (z,) [m]."""
+        command = self._controller.step(terms, self.guard.target(target_m), share, engaged_s)
+        torque_nm = self.guard.torque(command.torque_nm, terms)
+        if torque_nm is command.torque_nm:
+            return command
+        return Command(torque_nm, command.coupling_force_n, command.sub_task_error_rad_s)
 
     def close(self) -> None:
         """Stop the robot, tell the peer, close the device. Never raises before the stop."""
@@ -286,8 +294,8 @@ class Site:
         peer: PeerSample | None,
         terms: RobotTerms,
         command: Command,
-        torque_nm: FloatArray | None,
         share: float,
+        engaged_s: float,
     ) -> None:
         """Write this tick's row."""
         target_m = self._supervisor.target_m
@@ -314,7 +322,7 @@ class Site:
             cut=self.guard.cut,
             q=terms.q,
             q_dot=terms.q_dot,
-            torque_nm=command.torque_nm if torque_nm is None else torque_nm,
+            torque_nm=command.torque_nm,
             position_m=terms.X,
             velocity_m_s=terms.X_dot,
             external_force_n=reading.wrench[: self._robot.task_dimension],
@@ -322,6 +330,7 @@ class Site:
             peer_position_m=nan if target_m is None else target_m,
             offset_m=self._supervisor.offset_m,
             force_share=share,
+            engaged_s=engaged_s,
             used_stamp_ns=0 if peer is None else peer.stamp_ns,
             used_arrival_ns=0 if peer is None else peer.arrival_ns,
             clock_offset_ns=0 if offset is None else offset.offset_ns,

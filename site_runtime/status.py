@@ -2,6 +2,8 @@
 
 import sys
 import threading
+import time
+from collections.abc import Sequence
 from math import isnan
 from types import TracebackType
 
@@ -12,6 +14,7 @@ from rich.text import Text
 from channel.packet import Reject
 from site_runtime.guard import cut_names
 from site_runtime.site import Site
+from site_runtime.site_events import Companion, SiteEvents
 from site_runtime.supervisor import DRIVEN, Cause, State
 from telemetry.recorder_process import RecorderProcess
 
@@ -20,24 +23,31 @@ LOG_INTERVAL_S = 10.0
 
 
 class StatusLine:
-    """Prints one line about a site, from a thread of its own: a stopped terminal stalls only it.
+    """Tells a site's events and prints one line about it, from a thread of its own.
 
-    Rewritten in place on a terminal twice a second; in a log, one line every ten seconds.
+    So a stopped terminal stalls only that. The line is rewritten in place on a terminal twice a
+    second; in a log, it comes every ten seconds. `live` says whether it comes at all.
     """
 
     def __init__(
-        self, site: Site, recorder: RecorderProcess | None = None, *, quiet: bool = False
+        self,
+        site: Site,
+        companions: Sequence[Companion] = (),
+        events: SiteEvents | None = None,
+        *,
+        live: bool = True,
     ) -> None:
         self._site = site
-        self._recorder = recorder
-        self._in_place = sys.stderr.isatty()
+        self._companions = companions
+        self._events = events
+        self._live = live
+        self._in_place = live and sys.stderr.isatty()
         self._interval_s = LIVE_INTERVAL_S if self._in_place else LOG_INTERVAL_S
-        self._quiet = quiet
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._print_lines, name="status", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="status", daemon=True)
 
     def __enter__(self) -> "StatusLine":
-        if not self._quiet:
+        if self._live or self._events is not None:
             self._thread.start()
         return self
 
@@ -53,17 +63,28 @@ class StatusLine:
             if self._in_place:
                 sys.stderr.write("\n")
 
-    def _print_lines(self) -> None:
-        before = self._site.ticks
-        while not self._ended.wait(self._interval_s):
-            ticks = self._site.ticks
-            line = describe(self._site, (ticks - before) / self._interval_s, self._recorder)
-            before = ticks
-            sys.stderr.write(f"\r\x1b[K{line}" if self._in_place else f"{line}\n")
-            sys.stderr.flush()
+    def _run(self) -> None:
+        ticks, since_s = self._site.ticks, time.monotonic()
+        while not self._ended.wait(min(self._interval_s, LIVE_INTERVAL_S)):
+            self._tell_events()
+            now_s = time.monotonic()
+            if self._live and now_s - since_s >= self._interval_s:
+                rate_hz = (self._site.ticks - ticks) / (now_s - since_s)
+                self._print_line(rate_hz)
+                ticks, since_s = self._site.ticks, now_s
+        self._tell_events()
+
+    def _tell_events(self) -> None:
+        if self._events is not None:
+            self._events.tell()
+
+    def _print_line(self, rate_hz: float) -> None:
+        line = describe(self._site, rate_hz, *self._companions)
+        sys.stderr.write(f"\r\x1b[K{line}" if self._in_place else f"{line}\n")
+        sys.stderr.flush()
 
 
-def describe(site: Site, rate_hz: float, recorder: RecorderProcess | None = None) -> str:
+def describe(site: Site, rate_hz: float, *companions: Companion) -> str:
     """One line: state, rate, round trip, margin to the certified one, position error, troubles."""
     round_trip_ms = site.round_trip_s * 1e3
     margin_ms = (site.margin.certified_s - site.margin.loop_s) * 1e3
@@ -86,8 +107,7 @@ def describe(site: Site, rate_hz: float, recorder: RecorderProcess | None = None
         parts.append("the peer has ANOTHER session file")
     if site.failure is not None:
         parts.append(f"{type(site.failure).__name__}: {site.failure}")
-    if recorder is not None and recorder.trouble is not None:
-        parts.append(recorder.trouble)
+    parts += [trouble for companion in companions if (trouble := companion.trouble) is not None]
     return " · ".join(parts)
 
 

@@ -38,6 +38,11 @@ class SiteClock:
         """Whether enough batches came for the offset to be worth using."""
         return self._heard >= SETTLE_BATCHES
 
+    @property
+    def offset_ns(self) -> int:
+        """What put on a stamp gives the observer's clock [ns], as known now."""
+        return self._offset_ns
+
     def observe(self, newest_stamp_ns: int, arrival_ns: int) -> None:
         """Take note of one batch: its newest stamp [ns, site] and its arrival [ns, observer]."""
         offset_ns = arrival_ns - newest_stamp_ns

@@ -42,6 +42,11 @@ class Pump(Generic[T]):
         """Items dropped so far because the consumer was not fast enough."""
         return self._dropped
 
+    @property
+    def waiting(self) -> int:
+        """Items offered that the consumer has not been given yet."""
+        return len(self._items)
+
     def stalled_s(self) -> float:
         """Time the consumer has been in its present call [s]; zero between calls."""
         since = self._busy_since

@@ -7,16 +7,12 @@ closes the other end however the site dies, and what the site had put is still i
 
 import json
 import mmap
-import os
 import platform
-import select
-import signal
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -25,8 +21,9 @@ from typing import Final, Self
 import numpy as np
 
 from telemetry.backlog import Backlog
+from telemetry.companion import input_ended, stand_back
 from telemetry.incidents import Incident, IncidentWatch
-from telemetry.piece import Piece
+from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.recording import RecordingSource, RecordingWriter
 from telemetry.row_ring import RecorderStatus, RowRing, SiteEvent
 from telemetry.rows import LAYOUT_VERSION, RowArray
@@ -77,6 +74,22 @@ class RecorderOptions:
         return cls(**values)
 
 
+def about_run(
+    session_name: str, digest: int, epoch: int, states: Mapping[int, str]
+) -> dict[str, str]:
+    """Return what a recording tells of its run, and of the programs here."""
+    return {
+        "session": session_name,
+        "digest": f"{digest:016x}",
+        "epoch": str(epoch),
+        "layout_version": str(LAYOUT_VERSION),
+        "states": json.dumps(states),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{name: version(name) for name in _PROGRAMS},
+    }
+
+
 class Recorder:
     """One thread drains the ring into a backlog, another writes the backlog to the disk."""
 
@@ -91,16 +104,7 @@ class Recorder:
             layout.dimension,
             options.wall_offset_ns,
             options.session_text,
-            {
-                "session": options.session_name,
-                "digest": f"{layout.digest:016x}",
-                "epoch": str(layout.epoch),
-                "layout_version": str(LAYOUT_VERSION),
-                "states": json.dumps(options.states),
-                "python": platform.python_version(),
-                "platform": platform.platform(),
-                **{name: version(name) for name in _PROGRAMS},
-            },
+            about_run(options.session_name, layout.digest, layout.epoch, options.states),
         )
         self._watch = IncidentWatch(
             {n: name for n, name in options.states.items() if name in options.incident_states}
@@ -133,7 +137,7 @@ class Recorder:
 
     def run(self, descriptor: int) -> None:
         """Record until this input ends, then all that is left."""
-        while self._writer.is_alive() and not _ended(descriptor, DRAIN_S):
+        while self._writer.is_alive() and not input_ended(descriptor, DRAIN_S):
             self.drain()
             self._report()
         self.finish()
@@ -150,8 +154,10 @@ class Recorder:
 
     def _arrivals_for(self, rows: RowArray) -> RowArray:
         """Take what arrived up to the last of these rows: it is there before the row is."""
+        if not len(rows):
+            return NO_ARRIVALS
         arrivals = self._ring.arrivals_from(self._next_arrival)
-        last = rows["sequence"][-1] if len(rows) else 0
+        last = rows["sequence"][-1]
         arrivals = arrivals[: np.searchsorted(arrivals["row"], last, side="right")]
         if len(arrivals):
             self._next_arrival = int(arrivals["number"][-1]) + 1
@@ -290,25 +296,9 @@ class Recorder:
         return SiteEvent(time.monotonic_ns(), f"recorder: {text}")
 
 
-def _ended(descriptor: int, wait_s: float) -> bool:
-    readable, _, _ = select.select([descriptor], [], [], wait_s)
-    return bool(readable) and not os.read(descriptor, 1)
-
-
-def _be_ordinary() -> None:
-    """Take nothing from the loop: neither its priority nor the CPU that it stays on."""
-    # The site ends this process in its own time, and a service manager tells every process of it.
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    with suppress(OSError):
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))
-
-
 def main() -> None:
     """Record the ring in the memory whose file descriptor is the first argument."""
-    _be_ordinary()
+    stand_back()
     ring = RowRing.attach(mmap.mmap(int(sys.argv[1]), 0))
     try:
         options = RecorderOptions.from_json(sys.stdin.readline())

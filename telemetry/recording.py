@@ -224,10 +224,11 @@ def read_recording(*paths: Path | str) -> Mapping[str, Recording]:
         if parts and parts[0].metadata != recording.metadata:
             raise TelemetryError(f"{path} is of another run than the files before it")
         parts.append(recording)
-    return {site: _joined(parts) for site, parts in found.items()}
+    return {site: joined(parts) for site, parts in found.items()}
 
 
-def _joined(parts: Sequence[Recording]) -> Recording:
+def joined(parts: Sequence[Recording]) -> Recording:
+    """Return segments of one run, in their order, as one recording."""
     return Recording(
         np.concatenate([part.rows for part in parts]),
         tuple(event for part in parts for event in part.events),

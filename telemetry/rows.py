@@ -84,6 +84,9 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         "force_share": Column(
             "<f8", "scalar", "1", "Share of stiffness and force ceiling in force: ramp, de-rating"
         ),
+        "engaged_s": Column(
+            "<f8", "scalar", "s", "Time since engagement; the sub-task ramps in with it; NaN: off"
+        ),
         "used_stamp_ns": Column(
             "<i8", "scalar", "ns", "Stamp of the peer's sample in use, on its clock; 0: none"
         ),

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import Final
 
 import numpy as np
@@ -103,6 +104,7 @@ class TelemetryStream:
         self._peer_position_m = ring["peer_position_m"]
         self._offset_m = ring["offset_m"]
         self._force_share = ring["force_share"]
+        self._engaged_s = ring["engaged_s"]
         self._used_stamp_ns = ring["used_stamp_ns"]
         self._used_arrival_ns = ring["used_arrival_ns"]
         self._clock_offset_ns = ring["clock_offset_ns"]
@@ -155,6 +157,7 @@ class TelemetryStream:
         peer_position_m: FloatArray | float,
         offset_m: FloatArray,
         force_share: float,
+        engaged_s: float,
         used_stamp_ns: int,
         used_arrival_ns: int,
         clock_offset_ns: int,
@@ -202,6 +205,7 @@ class TelemetryStream:
         self._peer_position_m[i] = peer_position_m
         self._offset_m[i] = offset_m
         self._force_share[i] = force_share
+        self._engaged_s[i] = engaged_s
         self._used_stamp_ns[i] = used_stamp_ns
         self._used_arrival_ns[i] = used_arrival_ns
         self._clock_offset_ns[i] = clock_offset_ns
@@ -259,6 +263,7 @@ class TelemetryStream:
         self._torque_nm[i] = 0.0
         self._coupling_force_n[i] = 0.0
         self._force_share[i] = 0.0
+        self._engaged_s[i] = nan
         self._count += 1
         self._count_row(self._count)
 

@@ -56,6 +56,11 @@ class Dashboard:
         """Batches not shown because a sink was not fast enough."""
         return sum(pump.dropped for pump in self._pumps)
 
+    @property
+    def waiting_batches(self) -> int:
+        """Batches offered that the slowest sink has not taken up yet."""
+        return max((pump.waiting for pump in self._pumps), default=0)
+
     def stalled_s(self) -> float:
         """How long the slowest sink has been blocked [s]; a health signal."""
         return max((pump.stalled_s() for pump in self._pumps), default=0.0)

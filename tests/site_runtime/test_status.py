@@ -108,8 +108,10 @@ def test_a_log_gets_whole_lines_and_the_thread_ends_with_the_context(
     assert all(text.startswith("local  READY") for text in lines)
 
 
-def test_quiet_prints_nothing(fresh: Site, capsys: pytest.CaptureFixture[str]) -> None:
-    with StatusLine(fresh, quiet=True) as line:
+def test_a_site_that_is_not_watched_prints_nothing(
+    fresh: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with StatusLine(fresh, live=False) as line:
         assert not line._thread.is_alive()
     assert capsys.readouterr().err == ""
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from telemetry.backlog import Backlog, Piece
+from telemetry.companion import SharedMemory
 from telemetry.recorder import Recorder, RecorderOptions
-from telemetry.recorder_process import RecorderProcess, SharedMemory
+from telemetry.recorder_process import RecorderProcess
 from telemetry.recording import Recording, read_recording
 from telemetry.row_ring import SiteEvent
 from telemetry.rows import COLUMNS, TelemetryError, row_dtype
@@ -40,15 +41,19 @@ def options(folder: Path, **changes: object) -> RecorderOptions:
 
 
 def put(stream: TelemetryStream, rows: int, state: int = ENGAGED) -> None:
-    length = {"scalar": (), "joint": (2,), "task": (2,), "reason": (12,)}
     for _ in range(rows):
         stream.arrived([stream.count.to_bytes(8, "little"), b"second"])
-        fields = {
-            name: np.full(length[column.axis], stream.count % 250)
-            for name, column in COLUMNS.items()
-            if name != "sequence"
-        }
-        stream.put(**fields | {"state": state, "stamp_ns": time.monotonic_ns()})
+        put_row(stream, state)
+
+
+def put_row(stream: TelemetryStream, state: int = ENGAGED) -> None:
+    length = {"scalar": (), "joint": (2,), "task": (2,), "reason": (12,)}
+    fields = {
+        name: np.full(length[column.axis], stream.count % 250)
+        for name, column in COLUMNS.items()
+        if name != "sequence"
+    }
+    stream.put(**fields | {"state": state, "stamp_ns": time.monotonic_ns()})
 
 
 def until(condition: Callable[[], object], what: str) -> None:
@@ -140,6 +145,20 @@ def test_rows_events_and_what_explains_them_are_recorded(
     assert incidents(tmp_path) == {}
     status = stream.ring.status
     assert (status.recording, status.written, status.lost) == (True, 2500, 0)
+
+
+def test_what_arrived_for_a_row_that_is_still_being_written_waits_for_it(
+    tmp_path: Path, stream: TelemetryStream
+) -> None:
+    recorder = Recorder(stream.ring, options(tmp_path))
+    recorder.start()
+    for _ in range(3):
+        stream.arrived([stream.count.to_bytes(8, "little"), b"second"])
+        recorder.drain()
+        put_row(stream)
+        recorder.drain()
+    recorder.finish()
+    assert_as_put(recorded(tmp_path))
 
 
 def test_a_full_disk_loses_nothing_while_there_is_room_in_memory(

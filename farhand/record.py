@@ -1,0 +1,107 @@
+"""`farhand record`: both sites' rows off the network, into files."""
+
+import os
+import time
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from farhand.console import ERR, OUT, user_errors
+from farhand.feed import Feed
+from site_runtime.clock import SteadyClock
+from site_runtime.daemon import Connect, Duration, SessionPath, StopSignals
+from site_runtime.session import Session, load_session
+from site_runtime.supervisor import State
+from telemetry.network_recorder import NetworkRecorder, Recorded
+from telemetry.recording import Gap
+from telemetry.rows import TelemetryError
+
+POLL_S = 0.02
+EXIT_NOT_RECORDED = 1
+SHOWN = 10
+
+
+def record(
+    session: SessionPath,
+    connect: Connect = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder to write into; by default one of its own, here."),
+    ] = None,
+    duration: Duration = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Also into a folder that holds recordings.")
+    ] = False,
+) -> None:
+    """Record both sites off the network, from any machine that reaches them, until Ctrl-C."""
+    with user_errors():
+        loaded = load_session(session)
+        folder = _folder(loaded, out, force)
+        states = {state.value: state.name for state in State}
+        with (
+            StopSignals(SteadyClock(), duration) as signals,
+            closing(Feed(loaded, connect)) as feed,
+        ):
+            _say(f"recording in {folder}")
+            recorder = NetworkRecorder(folder, loaded.name, loaded.text, states)
+            try:
+                _record(feed, recorder, signals)
+            finally:
+                recorded = recorder.close()
+                for notice in recorder.notices():
+                    _say(notice)
+        _tell_strangers(feed.foreign, feed.broken)
+    for run in recorded:
+        OUT.print(_summary(run), soft_wrap=True, highlight=False)
+    if not recorded:
+        _say("nothing was recorded: no site was heard")
+    if not recorded or any(run.unwritten for run in recorded):
+        raise typer.Exit(EXIT_NOT_RECORDED)
+
+
+def _folder(session: Session, out: Path | None, force: bool) -> Path:
+    folder = out or Path(f"{session.name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}")
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written to")
+    if not force and any(folder.glob("*.mcap")):
+        raise TelemetryError(f"{folder} holds recordings: name another folder, or use --force")
+    return folder
+
+
+def _record(feed: Feed, recorder: NetworkRecorder, signals: StopSignals) -> None:
+    told = False
+    while not signals.asked_to_stop():
+        for batch, arrival_ns in feed.receive():
+            recorder.offer(batch, arrival_ns)
+        for notice in recorder.notices():
+            _say(notice)
+        if (feed.foreign or feed.broken) and not told:
+            told = True
+            _tell_strangers(feed.foreign, feed.broken)
+        time.sleep(POLL_S)
+
+
+def _tell_strangers(foreign: int, broken: int) -> None:
+    if foreign:
+        _say(f"{foreign} batches were of another session file and not recorded")
+    if broken:
+        _say(f"{broken} payloads were no telemetry of this version and not recorded")
+
+
+def _summary(run: Recorded) -> str:
+    gaps = f"{len(run.gaps)} gaps: {_places(run.gaps)}" if run.gaps else "no gap"
+    unwritten = f"; {run.unwritten} not written: {run.error}" if run.unwritten else ""
+    return f"{run.site}: {run.rows} rows of run {run.epoch}, {gaps}{unwritten}"
+
+
+def _places(gaps: tuple[Gap, ...]) -> str:
+    told = ", ".join(f"{gap.rows} from row {gap.first} on" for gap in gaps[:SHOWN])
+    return told + (", …" if len(gaps) > SHOWN else "")
+
+
+def _say(line: str) -> None:
+    ERR.print(line, soft_wrap=True, highlight=False, markup=False)
