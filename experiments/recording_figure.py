@@ -46,6 +46,7 @@ _GAP_STYLE: Final[Mapping[str, Any]] = MappingProxyType(
 _WIDTH_IN: Final = 14.0
 _PANEL_IN: Final = 2.2
 _BANDS_IN: Final = 1.1
+_FAR_BEYOND: Final = 4.0
 _LINEAR_US: Final = 100.0  # the scale is logarithmic above
 _JOINTS_A_COLUMN: Final = 8
 _NAMED_SHARE: Final = 0.06  # of the width, from which a band has room for its name
@@ -208,6 +209,9 @@ def _draw_age(panel: _Panel) -> None:
     first = panel.traces[0]
     certified_ms = 1e3 * first.fields["certified_round_trip_s"]
     panel.curve(first, certified_ms, "certified", _LIMIT, "--")
+    linear_ms = float(np.max(certified_ms, initial=1.0))
+    if panel.axes.get_ylim()[1] > _FAR_BEYOND * linear_ms:
+        panel.axes.set_yscale("symlog", linthresh=linear_ms)  # or the limit lies on the floor
     panel.finish("loop age [ms]", 0.0)
 
 

@@ -13,6 +13,7 @@ from farhand.console import ERR, OUT, user_errors
 from farhand.feed import Feed
 from site_runtime.clock import SteadyClock
 from site_runtime.daemon import Connect, Duration, SessionPath, StopSignals
+from site_runtime.keys import SiteId
 from site_runtime.session import Session, load_session
 from site_runtime.supervisor import State
 from telemetry.network_recorder import NetworkRecorder, Recorded
@@ -22,6 +23,7 @@ from telemetry.rows import TelemetryError
 POLL_S = 0.02
 EXIT_NOT_RECORDED = 1
 SHOWN = 10
+SILENT_S = 3.0
 
 
 def record(
@@ -73,16 +75,42 @@ def _folder(session: Session, out: Path | None, force: bool) -> Path:
 
 
 def _record(feed: Feed, recorder: NetworkRecorder, signals: StopSignals) -> None:
-    told = False
+    told, hearing = False, _Hearing()
     while not signals.asked_to_stop():
         for batch, arrival_ns in feed.receive():
             recorder.offer(batch, arrival_ns)
-        for notice in recorder.notices():
+            hearing.heard(SiteId(batch.site))
+        for notice in (*recorder.notices(), *hearing.changes()):
             _say(notice)
         if (feed.foreign or feed.broken) and not told:
             told = True
             _tell_strangers(feed.foreign, feed.broken)
         time.sleep(POLL_S)
+
+
+class _Hearing:
+    """Which sites are heard, and when that changes."""
+
+    def __init__(self) -> None:
+        self._last_s = dict.fromkeys(SiteId, time.monotonic())
+        self._silent: set[SiteId] = set()
+        self._back: set[SiteId] = set()
+
+    def heard(self, site: SiteId) -> None:
+        self._last_s[site] = time.monotonic()
+        if site in self._silent:
+            self._silent.remove(site)
+            self._back.add(site)
+
+    def changes(self) -> list[str]:
+        """Return what changed since the last call."""
+        late_s = time.monotonic() - SILENT_S
+        fallen = {site for site, last_s in self._last_s.items() if last_s < late_s} - self._silent
+        self._silent |= fallen
+        told = [f"{site.label}: heard again" for site in sorted(self._back)]
+        told += [f"{site.label}: nothing heard for {SILENT_S:g} s" for site in sorted(fallen)]
+        self._back.clear()
+        return told
 
 
 def _tell_strangers(foreign: int, broken: int) -> None:

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from site_runtime.clock import SteadyClock
-from site_runtime.session import Session
+from site_runtime.session import Session, named_files
 from site_runtime.site import Site
 from site_runtime.supervisor import State
 from telemetry.companion import SharedMemory
@@ -36,6 +36,7 @@ def start_recorder(session: Session, site: Site, memory: SharedMemory) -> Record
             keep_s=session.recorder.keep_s,
             session_name=session.name,
             session_text=session.text,
+            session_files={key: str(path) for key, path in named_files(session).items()},
             site=label,
             wall_offset_ns=time.time_ns() - SteadyClock().now_ns(),
             states={state.value: state.name for state in State},

@@ -7,8 +7,10 @@ nor a machine's real-time settings and recordings change it, every other key doe
 import hashlib
 import json
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -114,6 +116,7 @@ class Session(SessionFile):
         return self.local if identity is SiteId.LOCAL else self.remote
 
 
+NO_FILES: Mapping[str, Path] = MappingProxyType({})
 _MOST_TEXT = 100_000
 _MOST_LINE = 2_000
 _ADAPTER = TypeAdapter(SessionFile)
@@ -126,6 +129,20 @@ PATH_KEYS = (
 """The keys that name files, relative to the session file."""
 
 
+def named_files(session: Session) -> dict[str, Path]:
+    """Return the files that the session names and both sites must agree on, by their keys."""
+    named: dict[str, Path] = {}
+    for site in ("local", "remote"):
+        robot = getattr(session, site).robot
+        if isinstance(robot, UrdfArm):
+            named[f"{site}.robot.path"] = Path(robot.path)
+    for direction in DIRECTIONS:
+        delay = getattr(session.channel, direction)
+        if delay is not None and isinstance(delay.delay, TraceDelay):
+            named[f"channel.{direction}.delay.path"] = Path(delay.delay.path)
+    return named
+
+
 def load_session(path: Path | str) -> Session:
     """Read and validate a session file; raises SessionFileError with every problem found."""
     path = Path(path)
@@ -136,12 +153,15 @@ def load_session(path: Path | str) -> Session:
     return parse_session(text, path)
 
 
-def parse_session(text: str, path: Path) -> Session:
-    """Validate a session file's text; paths in it are relative to the folder of `path`."""
+def parse_session(text: str, path: Path, files: Mapping[str, Path] = NO_FILES) -> Session:
+    """Validate a session file's text; paths in it are relative to the folder of `path`.
+
+    `files` are to be read in place of those that it names, by their keys.
+    """
     _require_size(text, path)
     try:
         document = tomllib.loads(text)
-        _resolve_paths(document, path.resolve().parent)
+        _resolve_paths(document, path.resolve().parent, files)
         # As JSON, strict mode takes a list for a tuple and still refuses "1" for a number.
         as_json = json.dumps(document, default=str)
     except (ValueError, RecursionError) as error:
@@ -171,7 +191,7 @@ def _require_size(text: str, path: Path) -> None:
             raise SessionFileError(path, [Problem("the file", ABSENT, reason)])
 
 
-def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
+def _resolve_paths(document: dict[str, Any], folder: Path, files: Mapping[str, Path]) -> None:
     """Make the paths absolute, so that nothing depends on where a daemon is started."""
     for dotted in PATH_KEYS:
         *tables, key = dotted.split(".")
@@ -179,7 +199,7 @@ def _resolve_paths(document: dict[str, Any], folder: Path) -> None:
         for table in tables:
             holder = holder.get(table) if isinstance(holder, dict) else None
         if isinstance(holder, dict) and isinstance(holder.get(key), str):
-            holder[key] = str(folder / holder[key])
+            holder[key] = str(files.get(dotted, folder / holder[key]))
 
 
 def _digest(file: SessionFile) -> int:

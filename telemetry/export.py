@@ -23,7 +23,7 @@ WALL_COLUMN: Final = "wall_time_ns"
 EVENTS: Final = "events"
 
 _SESSION_TIME: Final = "Start of the tick in session time, on one timeline for both sites"
-_WALL_TIME: Final = "Start of the tick since 1970, on the wall clock as at the start of the run"
+_WALL_TIME: Final = "The same since 1970, by the wall clock of the site that gives the time"
 
 
 def write_parquet(folder: Path, take: Take) -> list[Path]:
@@ -56,9 +56,10 @@ def write_joined(path: Path, take: Take) -> None:
 
 def run_table(take: Take, run: Recording) -> pa.Table:
     """Return the rows of one run, all of them, bit by bit."""
+    times_ns = take.times_ns(run)
     columns = [
-        _column(TIME_COLUMN, take.times_ns(run) * 1e-9, "s", _SESSION_TIME),
-        _column(WALL_COLUMN, run.wall_times_ns, "ns", _WALL_TIME),
+        _column(TIME_COLUMN, times_ns * 1e-9, "s", _SESSION_TIME),
+        _column(WALL_COLUMN, times_ns + take.zero_wall_ns, "ns", _WALL_TIME),
     ]
     for name, column in COLUMNS.items():
         values = run.rows[name]

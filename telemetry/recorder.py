@@ -48,13 +48,15 @@ class RecorderOptions:
     """What the site tells its recorder.
 
     `states` names all supervisor states by number, `incident_states` those whose entry is an
-    incident. Stamps and `wall_offset_ns` together are the wall clock as the run started.
+    incident. `session_files` are paths of what the session names, by key. Stamps and
+    `wall_offset_ns` together are the wall clock as the run started.
     """
 
     folder: str
     keep_s: float
     session_name: str
     session_text: str
+    session_files: Mapping[str, str]
     site: str
     wall_offset_ns: int
     states: Mapping[int, str]
@@ -105,6 +107,7 @@ class Recorder:
             options.wall_offset_ns,
             options.session_text,
             about_run(options.session_name, layout.digest, layout.epoch, options.states),
+            {key: Path(path).read_bytes() for key, path in options.session_files.items()},
         )
         self._watch = IncidentWatch(
             {n: name for n, name in options.states.items() if name in options.incident_states}

@@ -8,7 +8,7 @@ import os
 import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,6 +39,8 @@ from telemetry.rows import RowArray, TelemetryError, row_dtype
 
 METADATA: Final = "farhand"
 SESSION_FILE: Final = "session.toml"
+NAMED: Final = " "
+"""Stands between `SESSION_FILE` and the key, in the name of an attachment that the key names."""
 
 _KEYS: Final = frozenset({"site", "joints", "dimension", "wall_offset_ns"})
 
@@ -47,6 +49,7 @@ _KEYS: Final = frozenset({"site", "joints", "dimension", "wall_offset_ns"})
 class RecordingSource:
     """Whose rows a recording holds; `metadata` is free text about the run.
 
+    `session_files` are the files that the session names, by their keys in it.
     `wall_offset_ns` put on a stamp gives the wall clock as it was when the run started.
     """
 
@@ -56,6 +59,7 @@ class RecordingSource:
     wall_offset_ns: int
     session_text: str
     metadata: Mapping[str, str]
+    session_files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 class RecordingWriter:
@@ -89,6 +93,10 @@ class RecordingWriter:
         }
         writer.add_metadata(METADATA, dict(source.metadata) | told)
         writer.add_attachment(0, 0, SESSION_FILE, "application/toml", source.session_text.encode())
+        for key, data in source.session_files.items():
+            writer.add_attachment(
+                0, 0, SESSION_FILE + NAMED + key, "application/octet-stream", data
+            )
         try:
             writer.flush()  # type: ignore[no-untyped-call]
         except OSError:
@@ -193,6 +201,7 @@ class Recording:
     metadata: Mapping[str, str]
     session_text: str
     complete: bool
+    session_files: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
@@ -236,6 +245,7 @@ def joined(parts: Sequence[Recording]) -> Recording:
         parts[0].metadata,
         parts[0].session_text,
         all(part.complete for part in parts),
+        parts[0].session_files,
     )
 
 
@@ -262,6 +272,7 @@ def _read(path: Path) -> Recording:
         contents.metadata,
         contents.session_text,
         complete,
+        contents.session_files,
     )
 
 
@@ -271,6 +282,7 @@ class _Contents:
     def __init__(self) -> None:
         self.metadata: Mapping[str, str] | None = None
         self.session_text = ""
+        self.session_files: dict[str, bytes] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._messages: dict[int, list[bytes]] = {}
@@ -287,6 +299,8 @@ class _Contents:
             self.metadata = record.metadata
         elif isinstance(record, Attachment) and record.name == SESSION_FILE:
             self.session_text = record.data.decode(errors="replace")
+        elif isinstance(record, Attachment) and record.name.startswith(SESSION_FILE + NAMED):
+            self.session_files[record.name.removeprefix(SESSION_FILE + NAMED)] = record.data
 
     def messages(self, topic: str) -> list[bytes]:
         """Messages of the channel whose topic ends so."""

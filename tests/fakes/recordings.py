@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from site_runtime.session import Session
+from site_runtime.session import Session, named_files
 from site_runtime.supervisor import State
 from telemetry.piece import NO_ARRIVALS, Piece
 from telemetry.recording import RecordingSource, RecordingWriter
@@ -40,7 +40,8 @@ def record(
         "python": "3.11.7",
     }
     shape = (rows["q"].shape[1], rows["position_m"].shape[1])
-    source = RecordingSource(site, *shape, wall_offset_ns, session.text, told | metadata)
+    files = {key: named.read_bytes() for key, named in named_files(session).items()}
+    source = RecordingSource(site, *shape, wall_offset_ns, session.text, told | metadata, files)
     writer = RecordingWriter(path, source)
     writer.write(Piece(rows[:0], tuple(events), arrivals))
     for start in range(0, len(rows), 100):

@@ -99,6 +99,15 @@ def test_other_gains_are_compared_and_written_as_a_recording(pair: Pair, tmp_pat
     assert not np.array_equal(computed.rows["torque_nm"], mine["torque_nm"])
 
 
+def test_a_recording_holds_the_robot_that_its_session_names(tmp_path: Path) -> None:
+    pair = Pair(load_session(EXPERIMENTS / "seven_dof.toml"))
+    pair.run(0.3)
+    done = run(recorded(pair, tmp_path, SiteId.REMOTE))
+    assert done.returncode == 0, done.stderr
+    assert "bit by bit as recorded" in done.stdout
+    assert done.stderr == ""
+
+
 def test_other_robots_are_refused(pair: Pair, tmp_path: Path) -> None:
     path = recorded(pair, tmp_path, SiteId.LOCAL)
     done = run(path, "--session", EXPERIMENTS / "seven_dof.toml")

@@ -17,6 +17,7 @@ from typer.testing import CliRunner, Result
 
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from experiments.simulation import Run
+from farhand import record as record_command
 from farhand.__main__ import app
 from site_runtime.keys import SiteId, telemetry_key
 from site_runtime.session import Session
@@ -169,13 +170,18 @@ def test_a_killed_recorder_leaves_readable_files(sites: Sites, tmp_path: Path) -
     assert all(len(run.rows) > 100 and run.gaps == () for run in runs)
 
 
-def test_nothing_heard_is_no_success(tmp_path: Path) -> None:
+def test_nothing_heard_is_told_and_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_command, "SILENT_S", 0.2)
     result = record(
-        *(DEMO, "--out", tmp_path / "out", "--duration", "0.2"),
+        *(DEMO, "--out", tmp_path / "out", "--duration", "0.5"),
         *("--connect", "tcp/127.0.0.1:1"),
     )
     assert result.exit_code == 1
     assert "nothing was recorded" in result.output
+    for site in ("local", "remote"):
+        assert result.output.count(f"{site}: nothing heard for 0.2 s") == 1
 
 
 def test_a_folder_that_holds_recordings_is_added_to_only_by_force(tmp_path: Path) -> None:

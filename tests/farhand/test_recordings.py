@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -101,6 +102,21 @@ def test_parquet_has_a_table_a_site_with_every_row_and_what_explains_it(
     [event] = pq.read_table(out / "events.parquet").to_pylist()
     assert (event["site"], event["text"]) == ("local", EVENTS[0].text)
     assert (out / "session.toml").read_text(encoding="utf-8") == demo_session.text
+
+
+def test_the_page_s_join_is_the_newest_remote_row_of_then(
+    folder: Path, tmp_path: Path, demo_run: Run, local_rows: RowArray
+) -> None:
+    assert farhand("export", folder, "--to", "parquet", "--out", tmp_path / "try-1").exit_code == 0
+    page = (DEMO.parents[1] / "docs" / "tools.md").read_text(encoding="utf-8")
+    [code] = [c for c in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "join_asof" in c]
+    names: dict[str, Any] = {}
+    exec(code.replace("try-1", str(tmp_path / "try-1")), names)  # noqa: S102 - the page's own
+    joined = names["joined"].sort_by("wall_time_ns")
+    ticks = (local_rows["sequence"] - local_rows["sequence"][0])[2:]
+    remote_m = demo_run.remote["position_m"][ticks - 2, 0]
+    assert joined.column("position_x").to_pylist() == local_rows["position_m"][:, 0].tolist()
+    assert joined.column("remote_position_x").to_pylist() == [None, None, *remote_m.tolist()]
 
 
 def test_csv_says_the_units_in_its_names_and_reads_back_bit_by_bit(

@@ -1,5 +1,6 @@
 """Recordings in the readers of others: every row and event by name, bit by bit."""
 
+import re
 import subprocess
 from importlib.resources import files
 from pathlib import Path
@@ -78,6 +79,17 @@ def test_the_decoder_of_ros_2_messages_reads_rows_events_and_arrivals(
     for one, arrival in zip(came, arrivals, strict=True):
         for name in ARRIVAL.names or ():
             assert_same_bits(getattr(one, name), arrival[name], name)
+
+
+def test_the_page_s_lines_read_the_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = some_rows(2, 2, 5)
+    path = record(tmp_path / "rows.mcap", rows, some_arrivals())
+    page = (Path(__file__).parents[2] / "docs" / "tools.md").read_text(encoding="utf-8")
+    [code] = [c for c in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "mcap_ros2" in c]
+    code = code.replace('"rows.mcap"', repr(str(path))).replace("/local/", "/remote/")
+    exec(code, {})  # noqa: S102 - the page's own
+    told = capsys.readouterr().out.splitlines()
+    assert [int(line.split()[1]) for line in told] == rows["time_ns"].tolist()
 
 
 @pytest.fixture(scope="module")

@@ -32,6 +32,7 @@ def options(folder: Path, **changes: object) -> RecorderOptions:
         "keep_s": 3600.0,
         "session_name": "demo",
         "session_text": "format = 1\n",
+        "session_files": {},
         "site": "local",
         "wall_offset_ns": time.time_ns() - time.monotonic_ns(),
         "states": STATES,
@@ -145,6 +146,21 @@ def test_rows_events_and_what_explains_them_are_recorded(
     assert incidents(tmp_path) == {}
     status = stream.ring.status
     assert (status.recording, status.written, status.lost) == (True, 2500, 0)
+
+
+def test_the_files_that_the_session_names_are_in_every_recording(
+    tmp_path: Path, stream: TelemetryStream
+) -> None:
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_bytes(b"<robot>\xc2\xb5</robot>")
+    named = {"remote.robot.path": str(urdf)}
+    recorder = Recorder(stream.ring, options(tmp_path / "out", session_files=named))
+    recorder.start()
+    urdf.unlink()
+    put(stream, 10, FAULT)
+    recorder.finish()
+    for recording in (recorded(tmp_path / "out"), *incidents(tmp_path / "out").values()):
+        assert recording.session_files == {"remote.robot.path": b"<robot>\xc2\xb5</robot>"}
 
 
 def test_what_arrived_for_a_row_that_is_still_being_written_waits_for_it(
