@@ -21,7 +21,7 @@ from site_runtime.certification import certify, hold_of, site_gains
 from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of, damping_of, robot_of
 from site_runtime.session import Session
-from site_runtime.supervisor import DRIVEN, STOPPED, State
+from site_runtime.supervisor import STOPPED, State
 from telemetry.energy import EnergyTrace
 from telemetry.rows import RowArray
 
@@ -137,8 +137,6 @@ class _SiteMeter:
         self._robot = robot
         self._damping = damping
         self._reference = reference
-        self._driven: bool | None = None
-        self._engaged_ns = 0
         self._zeta: tuple[int, FloatArray] | None = None
 
     def measure(
@@ -148,15 +146,15 @@ class _SiteMeter:
 
         As Λ = diag(joint) + Jᵀ diag(task) J and Js = Ẋ, the powers need no Jacobian.
         """
-        driven = np.isin(rows["state"], list(DRIVEN))
-        engaged_s = self._engaged_s(times_ns, rows, driven)
+        # a time since engagement is told of the ticks that command a torque
+        driven = np.isfinite(rows["engaged_s"])
         motions: list[SiteMotion] = []
         zetas = [] if self._zeta is None else [self._zeta]
         for tick in due.tolist():
             terms = self._robot.terms(rows["q"][tick], rows["q_dot"][tick])
             zeta = np.zeros_like(terms.q_dot)
             if self._reference is not None and driven[tick]:
-                zeta = self._reference(terms, float(engaged_s[tick]))
+                zeta = self._reference(terms, float(rows["engaged_s"][tick]))
             motions.append(SiteMotion(terms.q_dot - zeta, terms.M, rows["velocity_m_s"][tick]))
             zetas.append((int(times_ns[tick]), zeta))
         s = np.array(rows["q_dot"], np.float64)
@@ -171,21 +169,6 @@ class _SiteMeter:
         injected_w = np.einsum("kz,kz->k", rows["external_force_n"], X_dot)
         dissipated_w = np.square(s) @ self._damping.joint + np.square(X_dot) @ self._damping.task
         return np.column_stack((alive * injected_w, driven * dissipated_w)), motions
-
-    def _engaged_s(
-        self, times_ns: IntArray, rows: RowArray, driven: npt.NDArray[np.bool_]
-    ) -> FloatArray:
-        """Return how long this site has been driven at each row [s]."""
-        if self._driven is None:
-            # A site first seen driven may have been so since the session's start.
-            self._engaged_ns = int(times_ns[0] - rows["time_ns"][0])
-            self._driven = bool(driven[0])
-        starts = driven & ~np.concatenate(([self._driven], driven[:-1]))
-        since_ns = np.where(starts, times_ns, self._engaged_ns)
-        since_ns = np.maximum.accumulate(since_ns)
-        self._driven, self._engaged_ns = bool(driven[-1]), int(since_ns[-1])
-        engaged_s: FloatArray = (times_ns - since_ns).astype(np.float64) * 1e-9
-        return engaged_s
 
 
 def energy_meter(session: Session, reference: Reference | None) -> SessionEnergyMeter:

@@ -26,6 +26,7 @@ class Track:
         self._times_ns: IntArray = np.empty(_ROOM, np.int64)
         self._rows: RowArray = np.empty(_ROOM, row_dtype(joints, dimension))
         self._held = slice(0, 0)
+        self._run_begins = 0
         self._clock = SiteClock()
         self._epoch: int | None = None
         self._waiting: list[RowArray] = []
@@ -42,6 +43,11 @@ class Track:
         return self._rows[self._held]
 
     @property
+    def run_rows(self) -> RowArray:
+        """Those of them that are of the site's newest run."""
+        return self.rows[self._run_begins :]
+
+    @property
     def newest_ns(self) -> int | None:
         """Time of the newest row [ns]; None before the first."""
         return int(self.times_ns[-1]) if len(self.times_ns) else None
@@ -51,6 +57,7 @@ class Track:
         if batch.epoch != self._epoch:
             self._epoch = batch.epoch
             self.merge(settled_only=False)
+            self._run_begins = len(self.rows)
             self._clock.restart()
         self._clock.observe(int(batch.rows["stamp_ns"][-1]), arrival_ns)
         self._waiting.append(batch.rows)
@@ -81,6 +88,7 @@ class Track:
             old = min(old, self._taken)
             self._held = slice(self._held.start + old, self._held.stop)
             self._taken -= old
+            self._run_begins = max(0, self._run_begins - old)
 
     def _make_room(self, count: int) -> None:
         if self._held.stop + count <= len(self._rows):

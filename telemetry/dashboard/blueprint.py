@@ -57,6 +57,7 @@ def blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
     right = [
         plot("margin", "Margin of the certificate [ms]", _margin_range(picture)),
         plot("delay", "One-way delay [ms]"),
+        rrb.TextDocumentView(origin="/latency", name="Latency [ms] · median / p99 of 5 s"),
         plot("lateness", "Loop lateness [µs]"),
     ]
     return rrb.Blueprint(
@@ -69,7 +70,7 @@ def blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
                 row_shares=[1.3, 5, 1.4, 2.2],
             ),
             rrb.Vertical(*middle),
-            rrb.Vertical(*right),
+            rrb.Vertical(*right, row_shares=[1.0, 1.0, 1.2, 0.8]),
             column_shares=[5, 3, 3],
         ),
         rrb.TopPanel(state="hidden"),

@@ -13,6 +13,7 @@ from telemetry.dashboard.certificate import CertificatePanel
 from telemetry.dashboard.energies import Energies
 from telemetry.dashboard.scene import draw_scene
 from telemetry.dashboard.signals import Signals, common_style, draw_event, plot_apart
+from telemetry.dashboard.stages import LatencyPanel
 from telemetry.picture import Extent, Picture
 from telemetry.rows import TelemetryError
 from telemetry.stream import Batch
@@ -42,6 +43,7 @@ class Painter:
         common_style(canvas)
         self._arms = Arms(canvas, picture, self._extent, tracks)
         self._certificate = CertificatePanel(canvas, picture)
+        self._latency = LatencyPanel(canvas, picture, tracks)
         self._energies = (
             None if picture.meter is None else Energies(canvas, picture, picture.meter(), tracks)
         )
@@ -81,6 +83,7 @@ class Painter:
                     apart_m = np.linalg.norm(told_m - self._remote.told_at(times_ns), axis=1)
                     plot_apart(self._canvas, times_ns, apart_m)
         self._certificate.draw(until_ns, tuple(track.row_at(until_ns) for track in self._tracks))
+        self._latency.draw(until_ns)
         if self._energies is not None:
             self._energies.draw(until_ns, everything=everything)
         if self._arms.draw(until_ns):
