@@ -79,8 +79,6 @@ class SessionEnergyMeter:
         """Take the rows (k,) of both sites at these times (k,) [ns], one clock, rising."""
         if not len(times_ns):
             return EnergyTrace(times_ns, *(np.empty((0, columns)) for columns in (3, 2, 2)))
-        if self._last is not None and times_ns[0] - self._last[0] > GAP_NS:
-            self._last = self._measured_ns = None
         due = self._due(times_ns)
         measured = [
             site.measure(times_ns, rows, due)

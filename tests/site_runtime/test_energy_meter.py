@@ -151,6 +151,7 @@ def test_a_stopped_site_puts_nothing_in(pushed: Played) -> None:
     whole = measured(meter_of(session), run)
     local = run.local.copy()
     local["state"][2000:] = State.FAULT
+    local["engaged_s"][2000:] = np.nan
     stopped = measured(meter_of(session), Run(local, run.remote, ()))
     for work, expected in (
         (stopped.injected_j, whole.injected_j),

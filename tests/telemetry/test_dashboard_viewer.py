@@ -1,7 +1,6 @@
 """What viewers show of the dashboard: every view, to those that come late too, and stalled ones."""
 
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -186,7 +185,7 @@ def test_two_dashboards_and_a_viewer_that_comes_late_show_everything(
 
 
 def test_a_viewer_that_stands_still_holds_up_nobody(run: Any, chain: Chain) -> None:
-    """More than a stopped viewer lets through is offered; the offerer never waits."""
+    """Through a real viewer that is stopped; what a sink that blocks does, test_dashboard tells."""
     live = LiveServer(free_port())
     board = Dashboard(picture_of(chain), [live], queue_batches=50)
     with ExitStack() as stack:
@@ -213,4 +212,3 @@ def test_a_viewer_that_stands_still_holds_up_nobody(run: Any, chain: Chain) -> N
         wait_for(lambda: board.waiting_batches == 0)
         newest_ns = rounds * 12_000 * MS
         wait_for(lambda: end_ns(client) > newest_ns)
-        assert threading.active_count() < 20
