@@ -13,6 +13,7 @@ from site_runtime.clock import ManualClock
 from site_runtime.keys import SiteId
 from site_runtime.session import Session, SessionError
 from site_runtime.site import Site
+from site_runtime.supervisor import State
 from telemetry.rows import RowArray
 from telemetry.stream import decode_batch
 
@@ -97,7 +98,8 @@ class Simulation:
         for site in sites:
             site.close()
         local, remote = (_rows(batches) for batches in self._batches)
-        shared = min(len(local), len(remote))  # a site that fails writes no row of that tick
+        # the row of the tick that failed has a reading, but nothing that came of it
+        shared = min(np.count_nonzero(rows["state"] != State.FAULT) for rows in (local, remote))
         return Run(local[:shared], remote[:shared], tuple(map(_failure, filter(_failed, sites))))
 
     def _newest_second(self) -> Run:

@@ -15,7 +15,7 @@ from site_runtime.daemon import Connect, Duration, SessionPath
 from site_runtime.session import Session, load_session
 from telemetry.dashboard import Dashboard, LiveServer, RecordingFile, Sink, Viewer, start_viewer
 
-POLL_S = 0.02
+POLL_S = 0.01
 
 Save = Annotated[Path | None, typer.Option("--save", help="Also save what is shown, as FILE.rrd.")]
 Port = Annotated[int, typer.Option("--port", help="Loopback port for rerun viewers.")]

@@ -1,7 +1,6 @@
 """`farhand demo`: both sites on this machine, each a process, with the dashboard."""
 
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -26,6 +25,7 @@ from site_runtime.daemon import Duration, StopSignals
 from site_runtime.keys import SiteId
 from site_runtime.session import load_session
 from site_runtime.supervisor import State
+from telemetry.dashboard import free_port
 from telemetry.dashboard import screenshot as draw_screenshot
 from telemetry.stream import Batch
 
@@ -49,7 +49,7 @@ def demo(
     """Run both sites of a session on this machine, with the dashboard, until Ctrl-C."""
     with user_errors():
         loaded = load_session(session)
-        endpoints = {site: f"tcp/127.0.0.1:{_free_port()}" for site in SiteId}
+        endpoints = {site: f"tcp/127.0.0.1:{free_port()}" for site in SiteId}
         recent: deque[tuple[Batch, int]] = deque()
         newest: dict[int, Batch] = {}
         status = Live(
@@ -148,9 +148,3 @@ def _status(newest: dict[int, Batch]) -> Table:
             f"missed {rows['missed'][-1]}",
         )
     return table
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

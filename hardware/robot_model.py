@@ -106,6 +106,7 @@ class RobotModel:
         self._points = [placement.translation for placement in list(data.oMi)[1:]]
         self._points.append(data.oMf[frame].translation)
         self.joints: int = n
+        self.joint_names: tuple[str, ...] = tuple(model.names)[1:]
         self.task_dimension: int = task_dimension
         self.position_limits_rad: tuple[FloatArray, FloatArray] = (
             model.lowerPositionLimit.copy(),

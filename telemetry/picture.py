@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from telemetry.energy import EnergyMeter
 from telemetry.rows import TelemetryError
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,11 +25,19 @@ _MARGIN: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
+class UrdfView:
+    """Where a robot's body is described, and its joints there, in the order of the rows."""
+
+    path: Path
+    joint_names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class SiteView:
     """One site: its name, colour, joints, task dimensions, and its arm's shape.
 
     `chain` turns joint angles (r, n) [rad] into the points (r, n + 1, 3) [m] of the arm, from the
-    first joint's centre to the end effector.
+    first joint's centre to the end effector; `urdf` is the body around them, if it is to be shown.
     """
 
     name: str
@@ -35,6 +45,19 @@ class SiteView:
     chain: Callable[[FloatArray], FloatArray]
     joints: int
     dimension: int
+    urdf: UrdfView | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateView:
+    """What the gains are proven for: by which theorem, up to which round trip [s].
+
+    Points further apart than `align_within_m` keep the sites from engaging; None: never.
+    """
+
+    theorem: str
+    round_trip_s: float
+    align_within_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +91,8 @@ class Picture:
     """What a dashboard shows: the sites (local, remote), their scene, and the names of numbers.
 
     `state_names` by supervisor state, `cut_names` by the guard's bit mask. A force of
-    `full_scale_force_n` is drawn half as long as the shorter arm. TelemetryError if the sites do
-    not share their task dimensions.
+    `full_scale_force_n` is drawn half as long as the shorter arm. `meter` makes an energy meter at
+    its start, one a sink. TelemetryError if the sites do not share their task dimensions.
     """
 
     sites: tuple[SiteView, SiteView]
@@ -77,6 +100,8 @@ class Picture:
     state_names: Mapping[int, str]
     cut_names: Mapping[int, str] = field(default_factory=dict)
     full_scale_force_n: float = 10.0
+    certificate: CertificateView | None = None
+    meter: Callable[[], EnergyMeter] | None = None
     reach_m: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -17,6 +17,8 @@ from hardware.interface import DeviceError, FloatArray, ForceReading, ForceSenso
 from hardware.jr3 import Jr3, Jr3Settings
 from tests.fakes.jr3_node import Jr3Node
 
+pytestmark = pytest.mark.processes
+
 LOAD = np.array([10.0, -5.0, 20.0, 0.5, 1.0, -0.25])  # N, N·m
 _numbers = count()
 

@@ -11,6 +11,8 @@ from channel.link import Link, TappedLink
 from channel.memory_link import memory_links
 from channel.zenoh_link import ZenohNode, ZenohSettings
 
+pytestmark = pytest.mark.processes
+
 CAPACITY = 8
 
 

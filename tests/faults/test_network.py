@@ -20,9 +20,10 @@ from tests.faults import namespace
 from tests.faults.companion import ROOT
 from tests.faults.network import CLEAR, ImpairedNetwork, Impairment
 
-pytestmark = pytest.mark.skipif(
-    namespace.refusal() is not None, reason=str(namespace.refusal() or "")
-)
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(namespace.refusal() is not None, reason=str(namespace.refusal() or "")),
+]
 
 PORT = 9000
 SIZE = 156  # a pose packet of two dimensions

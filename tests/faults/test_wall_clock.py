@@ -12,7 +12,10 @@ import pytest
 from tests.faults import wall_clock
 from tests.faults.wall_clock import WallClock
 
-pytestmark = pytest.mark.skipif(wall_clock.COMPILER is None, reason="no C compiler `cc`")
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(wall_clock.COMPILER is None, reason="no C compiler `cc`"),
+]
 
 ASK = """
 import datetime, sys, time

@@ -19,6 +19,8 @@ from hardware.jr3 import FULL_SCALE, SATURATED, Jr3, Jr3Settings
 from hardware.registry import force_sensor, force_sensors
 from tests.fakes.jr3_node import FULL_SCALES, Frames, Jr3Node
 
+pytestmark = pytest.mark.processes
+
 ROOT = Path(__file__).parents[2]
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 LOAD = np.array([10.0, -5.0, 20.0, 0.5, 1.0, -0.25])  # N, N·m

@@ -32,7 +32,7 @@ from tests.fakes.hd import fake_hd
 from tests.fakes.hd.fake_hd import FakeHd
 
 needs_fake = pytest.mark.skipif(fake_hd.missing() is not None, reason=fake_hd.missing() or "")
-pytestmark = needs_fake
+pytestmark = [needs_fake, pytest.mark.processes]
 
 PUSH = np.array([0.03, 0.02])  # on the serial joints: 0.01 and 0.02 N·m on thigh and shin
 ROOT = Path(__file__).parents[2]

@@ -1,70 +1,47 @@
+"""What the dashboard draws, read back from the files that it saves."""
+
 import dataclasses
-import io
-import subprocess
 import threading
-import time
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
-from importlib.resources import files
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import psutil
 import pytest
 import rerun as rr
-from PIL import Image
 from rerun.chunk import RrdReader
 
-from telemetry import dashboard
 from telemetry.dashboard import (
-    FRAME_NS,
     Arrival,
     Dashboard,
     LiveServer,
     Painter,
     RecordingFile,
-    ViewerCrashError,
-    draw,
-    headless_viewer,
+    free_port,
     save_recording,
-    screenshot,
     start_viewer,
 )
-from telemetry.picture import (
-    LOCAL_COLOUR,
-    RED,
-    REMOTE_COLOUR,
-    ObstacleView,
-    Picture,
-    Scene,
-    SiteView,
-    WallView,
-)
-from telemetry.rows import RowArray, TelemetryError
-
-FloatArray = npt.NDArray[np.float64]
-Chain = Callable[[FloatArray], FloatArray]
-Recording = dict[str, tuple[npt.NDArray[np.int64], dict[str, list[Any]]]]
-
-MS = 1_000_000
-# The two sites' clocks read 5 s and 91 s at the start: these passages put both at 105 s.
-PASSAGES_NS = (100_000 * MS, 14_000 * MS)
-STATES = {0: "OFFLINE", 1: "READY", 2: "ENGAGED", 3: "HOLD", 4: "FAULT"}
-SCENE = Scene(
-    (ObstacleView("obstacle", (0.22, -0.12, 0.0), 0.06, 0.12),),
-    (WallView((0.54, 0.0, 0.0), (-1.0, 0.0, 0.0)),),
-)
-DEADLINE_S = 30.0
-
-driverless = pytest.mark.skipif(
-    not any(
-        icd
-        for place in ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-        for icd in Path(place).glob("*.json")
-    ),
-    reason="no Vulkan driver for the headless viewer (Debian: mesa-vulkan-drivers, libvulkan1)",
+from telemetry.dashboard.arms import FRAME_NS
+from telemetry.dashboard.certificate import certificate_text
+from telemetry.dashboard.stages import latency_text
+from telemetry.dashboard.styles import STATE_COLOURS, written
+from telemetry.picture import Scene
+from telemetry.rows import RowArray, TelemetryError, row_dtype
+from tests.telemetry.boards import (
+    DEADLINE_S,
+    MS,
+    PASSAGES_NS,
+    STATES,
+    Chain,
+    FloatArray,
+    Recording,
+    picture_of,
+    read,
+    scalars,
+    verify,
+    wait_for,
 )
 
 
@@ -73,46 +50,6 @@ def strict() -> Iterator[None]:
     rr.set_strict_mode(True)
     yield
     rr.set_strict_mode(False)
-
-
-def picture_of(chain: Chain, dimension: int = 2, scene: Scene = SCENE) -> Picture:
-    sites = (
-        SiteView("local", LOCAL_COLOUR, chain, 2, dimension),
-        SiteView("remote", REMOTE_COLOUR, chain, 3, dimension),
-    )
-    return Picture(sites, scene, STATES, {1: "torque"})
-
-
-def verify(path: Path) -> None:
-    command = [str(files("rerun_cli") / "rerun"), "rrd", "verify", str(path)]
-    subprocess.run(command, check=True, capture_output=True)
-
-
-def read(path: Path) -> Recording:
-    """Times [ns] and components of everything in a file that is not static, by entity."""
-    times: dict[str, list[int]] = {}
-    components: dict[str, dict[str, list[Any]]] = {}
-    for chunk in RrdReader(path).stream():
-        if chunk.is_static or "t" not in chunk.timeline_names:
-            continue
-        batch = chunk.to_record_batch()
-        times.setdefault(chunk.entity_path, []).extend(batch.column("t").cast("int64").to_pylist())
-        entity = components.setdefault(chunk.entity_path, {})
-        for name in batch.schema.names[2:]:
-            entity.setdefault(name, []).extend(batch.column(name).to_pylist())
-    recording: Recording = {}
-    for path_, entity_times in times.items():
-        order = np.argsort(entity_times, kind="stable")
-        recording[path_] = (
-            np.array(entity_times)[order],
-            {name: [values[i] for i in order] for name, values in components[path_].items()},
-        )
-    return recording
-
-
-def scalars(recording: Recording, path: str) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    times_ns, components = recording[path]
-    return times_ns, np.array(components["Scalars:scalars"], dtype=float)
 
 
 def norm_of(rows: RowArray, field: str) -> FloatArray:
@@ -151,6 +88,7 @@ def test_every_signal_is_recorded_bit_for_bit(run: Any, recording: Recording) ->
             "angle": rows["q"],
             "speed": rows["q_dot"],
             "clearance": rows["link_distance_m"] * 1e3,
+            "margin": (rows["certified_round_trip_s"] - rows["loop_bound_s"]) * 1e3,
         }
         for path, values in expected.items():
             times_ns, recorded = scalars(recording, f"/{path}/{name}")
@@ -169,6 +107,121 @@ def test_the_certified_round_trip_is_a_line_of_its_own(recording: Recording) -> 
     times_ns, recorded = scalars(recording, "/round_trip/certified")
     assert len(times_ns) == 12_000
     assert (recorded == 400.0).all()
+
+
+def test_the_margin_has_its_limit_at_zero(recording: Recording) -> None:
+    times_ns, recorded = scalars(recording, "/margin/limit")
+    assert len(times_ns) == 12_000
+    assert (recorded == 0.0).all()
+
+
+def test_what_the_energy_meter_says_is_recorded(run: Any, recording: Recording) -> None:
+    times_ns, parts = scalars(recording, "/energy/parts")
+    # from the first millisecond that both sites were heard at
+    assert (np.diff(times_ns) >= 10 * MS).all()
+    assert times_ns[-1] == pytest.approx(12_000 * MS, abs=60 * MS)
+    rows = times_ns // MS
+    local_m, remote_m = run.local["position_m"][rows], run.remote["position_m"][rows]
+    expected = np.column_stack((local_m[:, 0], remote_m[:, 0], local_m[:, 1] - remote_m[:, 1]))
+    assert parts == pytest.approx(expected, abs=1e-9)
+    assert scalars(recording, "/energy/V")[1][:, 0] == pytest.approx(expected.sum(axis=1), abs=1e-9)
+    for name, position_m in (("local", local_m), ("remote", remote_m)):
+        work_ns, work = scalars(recording, f"/work/{name}")
+        assert np.array_equal(work_ns, times_ns)
+        assert work == pytest.approx(position_m, abs=1e-9)
+
+
+def test_without_a_meter_no_energy_is_drawn(run: Any, chain: Chain, tmp_path: Path) -> None:
+    picture = dataclasses.replace(picture_of(chain), meter=None)
+    save_recording(tmp_path / "run.rrd", picture, run.batches(PASSAGES_NS)[:20])
+    recorded = read(tmp_path / "run.rrd")
+    assert "/torque/local" in recorded
+    assert not [path for path in recorded if path.startswith(("/energy", "/work"))]
+
+
+def test_the_panels_are_written_again_for_viewers_that_come_late(recording: Recording) -> None:
+    for path, most_ns, heading in (
+        ("/certificate", 350 * MS, "# **"),
+        ("/latency", 1_150 * MS, "| stage |"),
+    ):
+        times_ns, components = recording[path]
+        assert (np.diff(times_ns) <= most_ns).all()
+        assert times_ns[-1] == pytest.approx(12_000 * MS, abs=most_ns)
+        assert all(text.startswith(heading) for [text] in components["TextDocument:text"])
+        assert set(map(tuple, components["TextDocument:media_type"])) == {("text/markdown",)}
+
+
+def row(**values: Any) -> Any:
+    rows = np.zeros(1, row_dtype(2, 2))
+    defaults = {"state": 2, "force_share": 1.0, "loop_bound_s": 0.25}
+    for name, value in (defaults | {"certified_round_trip_s": 0.4} | values).items():
+        rows[name] = value
+    return rows[0]
+
+
+@pytest.mark.parametrize(
+    ("local", "remote", "told"),
+    [
+        (
+            {"position_m": (0.03, 0.0)},
+            {"loop_bound_s": 0.26, "position_m": (0.0, 0.04)},
+            ["CERTIFIED** margin **+140 ms**", "loop **260** of 400 ms (Theorem B)",
+             "local **ENGAGED 100%**", "apart **50 mm**"],
+        ),
+        (
+            {"loop_bound_s": 0.45, "force_share": 0.8},
+            {},
+            ["BEYOND THE CERTIFICATE** margin **-50 ms**", "local **ENGAGED 80%**"],
+        ),
+        (
+            {"state": 5, "force_share": 0.0, "loop_bound_s": np.nan, "offset_m": (0.02, 0.0)},
+            {"state": 5, "force_share": 0.0, "loop_bound_s": np.nan},
+            ["NO LOOP** yet · certified up to 400 ms", "local **ALIGNING**",
+             "apart **20 mm** (engages within 20 mm)"],
+        ),
+        ({"certified_round_trip_s": 0.0}, {}, ["NOT CERTIFIED"]),
+        ({"certified_round_trip_s": np.inf}, None, ["# loop **250 ms**"]),
+        (None, {"state": 9}, ["local **silent**", "remote **state 9 100%**"]),
+        (None, None, ["NO LOOP", "remote **silent**"]),
+    ],
+)  # fmt: skip
+def test_the_certificate_at_a_glance(
+    chain: Chain, local: dict[str, Any] | None, remote: dict[str, Any] | None, told: list[str]
+) -> None:
+    rows = [None if values is None else row(**values) for values in (local, remote)]
+    text = certificate_text(picture_of(chain), rows[0], rows[1])
+    for part in told:
+        assert part in text
+
+
+def test_latencies_are_a_table_of_both_directions() -> None:
+    local, remote = (np.zeros(20, row_dtype(2, 2)) for _ in range(2))
+    for rows in (local, remote):
+        rows["stamp_ns"] = 1_000 * MS + np.arange(20) * MS
+        rows["read_ns"], rows["step_ns"], rows["write_ns"] = 50_000, 250_000, 270_000
+        rows["sent_ns"] = 290_000
+    # the remote uses each local sample five ticks later, having had it after two
+    remote["used_stamp_ns"][5:] = local["stamp_ns"][:-5]
+    remote["used_arrival_ns"][5:] = local["stamp_ns"][:-5] + 2 * MS
+    lines = latency_text(("local", "remote"), local, remote).splitlines()
+    assert lines[0] == "| stage | local → remote | remote → local |"
+    cells = {line.split(" | ")[0].strip("| *"): line.split(" | ")[1:] for line in lines[2:]}
+    assert cells["read"][0] == "0.05 / 0.05"
+    assert cells["control"][0] == "0.20 / 0.20"
+    assert cells["network"][0] == "1.71 / 1.71"
+    assert cells["hold"][0] == "3.00 / 3.00"
+    assert cells["total"][0] == "**5.27 / 5.27**"
+    assert all(way[1].strip("|* ") == "– / –" for way in cells.values())
+
+
+def test_every_state_has_a_colour_of_its_own() -> None:
+    assert set(STATES.values()) == set(STATE_COLOURS)
+    assert len(set(STATE_COLOURS.values())) == len(STATE_COLOURS)
+
+
+def test_only_letters_that_the_viewer_has_are_written() -> None:
+    assert written("Säule λ Ж q̇ · 3") == "Säule λ Ж q̇ · 3"
+    assert written("\U0001f7e2 post\n柱") == "? post??"
 
 
 def test_arms_are_drawn_at_thirty_frames_a_second(
@@ -198,6 +251,20 @@ def test_the_ghost_is_the_peer_one_delay_ago(run: Any, recording: Recording, cha
         expected = chain(peer["q"][then_ns // MS])[:, :, :2].astype(np.float32)
         recorded = np.array([ghost[0] for ghost in ghosts if ghost])
         assert np.array_equal(recorded, expected)
+
+
+def test_forces_are_two_arrows_from_the_tip(run: Any, recording: Recording, chain: Chain) -> None:
+    picture = picture_of(chain)
+    for name, rows in (("local", run.local), ("remote", run.remote)):
+        times_ns, components = recording[f"/scene/{name}/forces"]
+        shown = rows[times_ns // MS]
+        vectors = np.array(components["Arrows2D:vectors"])
+        origins = np.array(components["Arrows2D:origins"])
+        tips_m = chain(shown["q"])[:, -1, :2].astype(np.float32)
+        for arrow, force in enumerate(("coupling", "external")):
+            expected = picture.arrows(shown[f"{force}_force_n"]).astype(np.float32)
+            assert np.array_equal(vectors[:, arrow], expected), force
+            assert np.array_equal(origins[:, arrow], tips_m)
 
 
 def test_a_ghost_waits_for_the_peers_rows(run: Any, chain: Chain, tmp_path: Path) -> None:
@@ -257,7 +324,7 @@ def test_events_carry_level_and_time(recording: Recording) -> None:
     levels = [level for [level] in components["TextLog:level"]]
     told = dict(zip(texts, levels, strict=True))
     assert told["   2.000 s  local is ENGAGED"] == "INFO"
-    assert told["   6.501 s  remote is HOLD"] == "WARN"
+    assert told["   6.501 s  remote is HOLD: nothing new of the peer for 6501 ms"] == "WARN"
     assert any("missed 3 ticks" in text for text in texts)
     assert any("rejected 2 packets" in text for text in texts)
     assert any("limit on torque" in text for text in texts)
@@ -276,6 +343,8 @@ def test_without_a_limit_or_an_obstacle_nothing_is_drawn_of_them(
     recorded = read(tmp_path / "run.rrd")
     assert "/round_trip/local" in recorded
     assert "/round_trip/certified" not in recorded
+    assert "/margin/local" not in recorded
+    assert "/margin/limit" not in recorded
     assert "/clearance/local" not in recorded
 
 
@@ -339,13 +408,6 @@ def test_arms_in_space_and_in_the_plane(
 
 
 # Live
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_a_dashboard_saves_what_it_is_offered(run: Any, chain: Chain, tmp_path: Path) -> None:
@@ -414,12 +476,12 @@ def test_live_pages_are_served_on_loopback_only(
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    live = LiveServer(dashboard._free_port())
+    live = LiveServer(free_port())
     shown = Dashboard(picture_of(chain), [live])
     wait_for(lambda: ("127.0.0.1", live.port) in listening(psutil.Process()))
     with pytest.raises(TelemetryError, match=str(live.port)):
         Dashboard(picture_of(chain), [live])
-    web_port = dashboard._free_port()
+    web_port = free_port()
     viewer = start_viewer(live, web_port)
     try:
         assert str(live.port) in viewer.address
@@ -432,93 +494,3 @@ def test_live_pages_are_served_on_loopback_only(
         viewer.close()
     assert viewer.process.returncode is not None
     assert shown.close(DEADLINE_S)
-
-
-# In a viewer
-
-
-def pixels(png: bytes) -> npt.NDArray[np.int16]:
-    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.int16)
-
-
-def count_of(image: npt.NDArray[np.int16], colour: tuple[int, int, int]) -> int:
-    return int((np.abs(image - np.array(colour)).max(axis=2) <= 12).sum())
-
-
-def retried(attempt: Callable[[], None]) -> None:
-    """Once more if the software driver took the viewer down."""
-    try:
-        attempt()
-    except ViewerCrashError:
-        attempt()
-
-
-@driverless
-@pytest.mark.viewer
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_viewer_shows_every_view(
-    run: Any, spatial_run: Any, chain: Chain, dimension: int
-) -> None:
-    # Seconds with contact, so that every force is to be seen.
-    batches = (run if dimension == 2 else spatial_run).batches(PASSAGES_NS)
-    batches = [item for item in batches if 109_000 * MS < item[1] < 115_000 * MS]
-    plots = {
-        "Position error [mm]": (LOCAL_COLOUR, REMOTE_COLOUR),
-        "Force [N]": (LOCAL_COLOUR, REMOTE_COLOUR),
-        "Joint torque [N·m]": (LOCAL_COLOUR, REMOTE_COLOUR),
-        "One-way delay [ms]": (LOCAL_COLOUR, REMOTE_COLOUR),
-        "Greatest loop age [ms]": (REMOTE_COLOUR, RED),
-        "Loop lateness [µs]": (LOCAL_COLOUR, REMOTE_COLOUR),
-    }
-    arms = {
-        "Local · 2 joints": (LOCAL_COLOUR, REMOTE_COLOUR),
-        "Remote · 3 joints": (REMOTE_COLOUR, LOCAL_COLOUR),
-    }
-
-    def attempt() -> None:
-        with headless_viewer() as client:
-            draw(client, picture_of(chain, dimension), batches)
-            state = client.get_state()
-            classes = {view.name: view.view_class for view in state.views}
-            expected = dict.fromkeys(plots, "TimeSeries")
-            expected |= dict.fromkeys(arms, f"{dimension}D")
-            expected |= dict.fromkeys(
-                ("Joint angles [rad]", "Joint speeds [rad/s]", "Clearance [mm]"), "TimeSeries"
-            )
-            expected |= {"Events": "TextLog", "Supervisor": "StateTimeline"}
-            assert classes == expected
-            assert [view.name for view in state.views if view.reports] == []
-            [timeline] = [t for r in state.recordings for t in r.timelines if t.name == "t"]
-            assert timeline.end == 9_999 * MS
-            complaints = [
-                entry.message
-                for entry in client.get_logs()
-                if entry.level != "INFO" and "Software rasterizer" not in entry.message
-            ]
-            assert complaints == []
-            shots = {
-                view.name: pixels(client.take_screenshot(view.view_id))
-                for view in state.views
-                if view.name in plots | arms
-            }
-        for name, (own, peer) in arms.items():
-            assert count_of(shots[name], own) > 1000, name
-            assert count_of(shots[name], peer) < 100, name
-        for name, colours in plots.items():
-            for colour in colours:
-                assert count_of(shots[name], colour) > 300, (name, colour)
-
-    retried(attempt)
-
-
-@driverless
-@pytest.mark.viewer
-def test_a_screenshot_is_a_picture_of_the_size_asked_for(
-    run: Any, chain: Chain, tmp_path: Path
-) -> None:
-    path = tmp_path / "run.png"
-    screenshot(path, picture_of(chain), run.batches(PASSAGES_NS)[:60], 1280, 720)
-    image = pixels(path.read_bytes())
-    assert image.shape == (720, 1280, 3)
-    assert count_of(image, LOCAL_COLOUR) > 300
-    assert count_of(image, REMOTE_COLOUR) > 300

@@ -1,17 +1,28 @@
 from typing import Any
 
 import numpy as np
+import pytest
 
 from telemetry.events import Event, EventLog
-from telemetry.rows import RowArray, row_dtype
+from telemetry.rows import NO_PEER_STATE, RowArray, row_dtype
 
-STATES = {0: "OFFLINE", 1: "READY", 2: "ENGAGED", 3: "HOLD", 4: "FAULT"}
+STATES = {
+    0: "OFFLINE",
+    1: "READY",
+    2: "ENGAGED",
+    3: "HOLD",
+    4: "FAULT",
+    5: "ALIGNING",
+    6: "RELEASED",
+    7: "EMERGENCY_STOP",
+}
 CUTS = {1: "torque", 4: "workspace"}
 MS = 1_000_000
 
 
 def rows_of(count: int, **fields: Any) -> RowArray:
     rows = np.zeros(count, row_dtype(2, 2))
+    rows["peer_state"] = NO_PEER_STATE
     for name, values in fields.items():
         rows[name] = values
     return rows
@@ -42,6 +53,49 @@ def test_a_state_is_told_when_it_changes_and_at_first() -> None:
         Event(7 * MS, "ERROR", "local is FAULT"),
         Event(8 * MS, "INFO", "local is state 9"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "level", "told"),
+    [
+        ({}, {"state": 5}, "WARN", "local is ALIGNING"),
+        ({}, {"state": 6, "requests": 2}, "WARN", "local is RELEASED: the clutch is open"),
+        ({}, {"state": 6, "requests": 1}, "WARN", "RELEASED: the device's clutch is open"),
+        ({"requests": 4}, {"state": 7}, "ERROR", "EMERGENCY_STOP: its operator stopped it"),
+        ({}, {"state": 7, "peer_state": 7}, "ERROR", "STOP: the peer is in emergency stop"),
+        ({}, {"state": 7}, "ERROR", "local is EMERGENCY_STOP"),
+        ({"state": 7, "requests": 8}, {"state": 1}, "INFO", "READY: its operator reset it"),
+        ({"state": 4}, {"state": 1}, "INFO", "local is READY"),
+        ({"state": 3, "requests": 8}, {"state": 1}, "INFO", "local is READY"),
+        ({}, {"state": 3, "peer_state": 4}, "WARN", "local is HOLD: the peer is FAULT"),
+        (
+            {},
+            {"state": 3, "loop_bound_s": 0.45, "certified_round_trip_s": 0.4},
+            "WARN",
+            "local is HOLD: loop 450 ms, certified 400 ms",
+        ),
+        ({}, {"state": 3, "stamp_ns": 90 * MS}, "WARN", "its loop stood still for 90 ms"),
+        ({}, {"state": 3}, "WARN", "local is HOLD"),
+    ],
+)
+def test_a_cause_is_told_where_the_rows_show_it(
+    before: dict[str, Any], after: dict[str, Any], level: str, told: str
+) -> None:
+    log = new_log()
+    observe(log, 0, rows_of(1, **{"state": 2} | before))
+    [event] = observe(log, 1, rows_of(1, **after))
+    assert event.level == level
+    assert event.text.endswith(told)
+
+
+def test_a_peer_of_whom_nothing_new_comes_is_a_cause_of_hold() -> None:
+    log = new_log()
+    for start_ms in range(0, 300, 50):
+        stamps_ms = start_ms + np.arange(50)
+        rows = rows_of(50, state=np.where(stamps_ms < 260, 2, 3), stamp_ns=stamps_ms * MS)
+        rows["used_stamp_ns"] = np.minimum(stamps_ms, 160) * MS
+        told = observe(log, start_ms, rows)
+    assert [event.text for event in told] == ["local is HOLD: nothing new of the peer for 100 ms"]
 
 
 def test_counters_tell_what_came_since_and_not_what_was_before() -> None:
