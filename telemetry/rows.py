@@ -1,5 +1,6 @@
 """One row a tick: the one record that the stream, result files and the dashboard share."""
 
+import struct
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
@@ -16,6 +17,7 @@ NO_PEER_STATE: Final = 255
 """The `peer_state` of a site that has never heard its peer."""
 
 MAX_JOINTS: Final = 16
+_CODES: Final = {"|u1": "B", "<u2": "H", "<u4": "I", "<u8": "Q", "<i8": "q", "<f8": "d"}
 DIMENSIONS: Final = (2, 3)
 
 REJECT_REASONS: Final = (
@@ -144,3 +146,13 @@ def row_dtype(joints: int, dimension: int) -> np.dtype[np.void]:
         (name, column.format, length.get(column.axis, ())) for name, column in COLUMNS.items()
     ]
     return np.dtype(fields)
+
+
+def row_struct(dtype: np.dtype[np.void]) -> struct.Struct:
+    """Return what packs the numbers of a row of this dtype, field after field."""
+    codes = []
+    for name in dtype.names or ():
+        field = dtype[name]
+        count = field.shape[0] if field.shape else 1
+        codes.append(f"{count}{_CODES[field.base.str]}")
+    return struct.Struct("<" + "".join(codes))

@@ -78,49 +78,8 @@ class TelemetryStream:
         layout = RingLayout(site, joints, dimension, self._capacity, session_digest, epoch)
         self.ring = RowRing.create(layout, allocate)
         self._count_row = self.ring.count_row
-        ring = self.ring.rows
-        self._ring = ring
-        # A view a field: assigning by view costs a quarter of assigning by field name.
-        self._sequence = ring["sequence"]
-        self._stamp_ns = ring["stamp_ns"]
-        self._time_ns = ring["time_ns"]
-        self._lateness_ns = ring["lateness_ns"]
-        self._duration_ns = ring["duration_ns"]
-        self._read_ns = ring["read_ns"]
-        self._step_ns = ring["step_ns"]
-        self._write_ns = ring["write_ns"]
-        self._sent_ns = ring["sent_ns"]
-        self._requests = ring["requests"]
-        self._state = ring["state"]
-        self._peer_state = ring["peer_state"]
-        self._cut = ring["cut"]
-        self._q = ring["q"]
-        self._q_dot = ring["q_dot"]
-        self._torque_nm = ring["torque_nm"]
-        self._position_m = ring["position_m"]
-        self._velocity_m_s = ring["velocity_m_s"]
-        self._external_force_n = ring["external_force_n"]
-        self._coupling_force_n = ring["coupling_force_n"]
-        self._peer_position_m = ring["peer_position_m"]
-        self._offset_m = ring["offset_m"]
-        self._force_share = ring["force_share"]
-        self._engaged_s = ring["engaged_s"]
-        self._used_stamp_ns = ring["used_stamp_ns"]
-        self._used_arrival_ns = ring["used_arrival_ns"]
-        self._clock_offset_ns = ring["clock_offset_ns"]
-        self._clock_uncertainty_ns = ring["clock_uncertainty_ns"]
-        self._one_way_delay_s = ring["one_way_delay_s"]
-        self._round_trip_s = ring["round_trip_s"]
-        self._loop_bound_s = ring["loop_bound_s"]
-        self._certified_round_trip_s = ring["certified_round_trip_s"]
-        self._manipulability = ring["manipulability"]
-        self._link_distance_m = ring["link_distance_m"]
-        self._midpoint_distance_m = ring["midpoint_distance_m"]
-        self._sub_task_error_rad_s = ring["sub_task_error_rad_s"]
-        self._lost = ring["lost"]
-        self._late = ring["late"]
-        self._rejected = ring["rejected"]
-        self._missed = ring["missed"]
+        self._ring = self.ring.rows
+        self._no_peer = (nan,) * dimension
 
     @property
     def count(self) -> int:
@@ -181,47 +140,52 @@ class TelemetryStream:
         not fit stays at the most that a column holds. A row whose assignment raises (a wrong shape)
         is not counted.
         """
-        i = self._count % self._capacity
-        self._sequence[i] = self._count
-        self._stamp_ns[i] = stamp_ns
-        self._time_ns[i] = time_ns
-        self._lateness_ns[i] = lateness_ns
-        self._duration_ns[i] = duration_ns
-        self._read_ns[i] = min(read_ns, _MOST)
-        self._step_ns[i] = min(step_ns, _MOST)
-        self._write_ns[i] = min(write_ns, _MOST)
-        self._sent_ns[i] = min(sent_ns, _MOST)
-        self._requests[i] = requests
-        self._state[i] = state
-        self._peer_state[i] = peer_state
-        self._cut[i] = cut
-        self._q[i] = q
-        self._q_dot[i] = q_dot
-        self._torque_nm[i] = torque_nm
-        self._position_m[i] = position_m
-        self._velocity_m_s[i] = velocity_m_s
-        self._external_force_n[i] = external_force_n
-        self._coupling_force_n[i] = coupling_force_n
-        self._peer_position_m[i] = peer_position_m
-        self._offset_m[i] = offset_m
-        self._force_share[i] = force_share
-        self._engaged_s[i] = engaged_s
-        self._used_stamp_ns[i] = used_stamp_ns
-        self._used_arrival_ns[i] = used_arrival_ns
-        self._clock_offset_ns[i] = clock_offset_ns
-        self._clock_uncertainty_ns[i] = clock_uncertainty_ns
-        self._one_way_delay_s[i] = one_way_delay_s
-        self._round_trip_s[i] = round_trip_s
-        self._loop_bound_s[i] = loop_bound_s
-        self._certified_round_trip_s[i] = certified_round_trip_s
-        self._manipulability[i] = manipulability
-        self._link_distance_m[i] = link_distance_m
-        self._midpoint_distance_m[i] = midpoint_distance_m
-        self._sub_task_error_rad_s[i] = sub_task_error_rad_s
-        self._lost[i] = min(lost, _MOST)
-        self._late[i] = min(late, _MOST)
-        self._rejected[i] = rejected
-        self._missed[i] = min(missed, _MOST)
+        followed_m = self._no_peer
+        if not isinstance(peer_position_m, float):
+            followed_m = peer_position_m.tolist()
+        self.ring.put_row(
+            self._count,
+            self._count,
+            stamp_ns,
+            time_ns,
+            lateness_ns,
+            duration_ns,
+            min(read_ns, _MOST),
+            min(step_ns, _MOST),
+            min(write_ns, _MOST),
+            min(sent_ns, _MOST),
+            state,
+            peer_state,
+            requests,
+            cut,
+            *q.tolist(),
+            *q_dot.tolist(),
+            *torque_nm.tolist(),
+            *position_m.tolist(),
+            *velocity_m_s.tolist(),
+            *external_force_n.tolist(),
+            *coupling_force_n.tolist(),
+            *followed_m,
+            *offset_m.tolist(),
+            force_share,
+            engaged_s,
+            used_stamp_ns,
+            used_arrival_ns,
+            clock_offset_ns,
+            clock_uncertainty_ns,
+            one_way_delay_s,
+            round_trip_s,
+            loop_bound_s,
+            certified_round_trip_s,
+            manipulability,
+            link_distance_m,
+            midpoint_distance_m,
+            sub_task_error_rad_s,
+            min(lost, _MOST),
+            min(late, _MOST),
+            *rejected,
+            min(missed, _MOST),
+        )
         self._count += 1
         self._count_row(self._count)
 
@@ -247,23 +211,24 @@ class TelemetryStream:
             return
         i = self._count % self._capacity
         self._ring[i] = self._ring[(self._count - 1) % self._capacity]
-        self._sequence[i] = self._count
-        self._stamp_ns[i] = stamp_ns
-        self._time_ns[i] = time_ns
-        self._lateness_ns[i] = lateness_ns
-        self._read_ns[i] = min(read_ns, _MOST)
-        self._step_ns[i] = min(step_ns, _MOST)
-        self._write_ns[i] = 0
-        self._sent_ns[i] = 0
-        self._requests[i] = requests
-        self._state[i] = state
-        self._cut[i] = 0
+        row = self._ring[i]
+        row["sequence"] = self._count
+        row["stamp_ns"] = stamp_ns
+        row["time_ns"] = time_ns
+        row["lateness_ns"] = lateness_ns
+        row["read_ns"] = min(read_ns, _MOST)
+        row["step_ns"] = min(step_ns, _MOST)
+        row["write_ns"] = 0
+        row["sent_ns"] = 0
+        row["requests"] = requests
+        row["state"] = state
+        row["cut"] = 0
         if reading is not None:
-            self._q[i], self._q_dot[i], self._external_force_n[i] = reading
-        self._torque_nm[i] = 0.0
-        self._coupling_force_n[i] = 0.0
-        self._force_share[i] = 0.0
-        self._engaged_s[i] = nan
+            row["q"], row["q_dot"], row["external_force_n"] = reading
+        row["torque_nm"] = 0.0
+        row["coupling_force_n"] = 0.0
+        row["force_share"] = 0.0
+        row["engaged_s"] = nan
         self._count += 1
         self._count_row(self._count)
 

@@ -123,7 +123,7 @@ def second_local(stage: Stage) -> None:
     stage.fault()
     second = pair.start_second(LOCAL)
     time.sleep(2.0)
-    stage.never_driven(second, "the second local")
+    stage.never_driven(second, "the second local", waits_for_silence=True)
     pair.end(second)
 
 
@@ -138,7 +138,7 @@ def second_local_in_wait(stage: Stage) -> None:
     stage.fault(LOCAL)
     pair.signal(LOCAL, signal.SIGCONT)
     time.sleep(2.0)
-    stage.never_driven(second, "the second local")
+    stage.never_driven(second, "the second local", waits_for_silence=True)
     pair.end(second)
 
 

@@ -119,15 +119,19 @@ class Stage:
         )
         return outcome
 
-    def never_driven(self, daemon: Daemon, who: str) -> None:
-        """It is a violation if a daemon has ever driven its robot, or ran too briefly to tell."""
+    def never_driven(self, daemon: Daemon, who: str, *, waits_for_silence: bool = False) -> None:
+        """It is a violation if a daemon has ever driven its robot, or ran too briefly to tell.
+
+        One that waits for a silence of the holder's may, after such a silence.
+        """
         rows = self.pair.rows_of(daemon)
         if len(rows) < 500:
             self.violations.append(f"{who} ran {len(rows)} ticks: nothing was tried")
         if among(rows, TORQUE).any():
             # a machine so busy that a peer is not heard for a second gives the robot away by rule
-            busy = self._longest_hold_s(daemon.site.peer) > TAKEOVER_NS * 1e-9
-            (self.deviations if busy else self.violations).append(f"{who} drove its robot")
+            silent = self._longest_hold_s(daemon.site.peer) > TAKEOVER_NS * 1e-9
+            by_rule = waits_for_silence and silent
+            (self.deviations if by_rule else self.violations).append(f"{who} drove its robot")
 
     def _longest_hold_s(self, site: SiteId) -> float:
         """Longest time [s] that a site has held, in its present run since the fault."""

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from telemetry.pump import Pump
+from telemetry.pump import PERIOD_S, Pump
 from telemetry.rows import TelemetryError
 
 DEADLINE_S = 20.0
@@ -27,6 +27,29 @@ def test_everything_offered_is_consumed_in_order_and_the_end_is_told_once() -> N
     assert [last for _, last in calls] == [False] * (len(calls) - 1) + [True]
     assert pump.dropped == 0
     assert pump.stalled_s() == 0.0
+
+
+def test_what_is_offered_is_consumed_soon_but_not_in_many_pieces() -> None:
+    calls: list[list[int]] = []
+    pump = Pump[int]("test", lambda items, last: calls.append(items))
+    time.sleep(3 * PERIOD_S)
+    assert calls == []  # nothing to do
+    began_s = time.monotonic()
+    item = 0
+    while time.monotonic() < began_s + 10 * PERIOD_S:
+        pump.offer(item)
+        item += 1
+        time.sleep(0.001)
+    assert pump.close(DEADLINE_S)
+    assert [i for items in calls for i in items] == list(range(item))
+    assert len(calls) <= (time.monotonic() - began_s) / PERIOD_S + 2
+
+
+def test_an_idle_one_ends_at_once() -> None:
+    calls: list[tuple[list[int], bool]] = []
+    pump = Pump[int]("test", lambda items, last: calls.append((items, last)))
+    assert pump.close(DEADLINE_S)
+    assert calls == [([], True)]
 
 
 def test_a_blocked_consumer_loses_the_oldest_and_the_producer_goes_on() -> None:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from telemetry.rows import COLUMNS, TelemetryError, row_dtype
+from telemetry.rows import COLUMNS, TelemetryError, row_dtype, row_struct
 
 
 @pytest.mark.parametrize(("joints", "dimension"), [(2, 2), (3, 2), (7, 3)])
@@ -15,6 +15,21 @@ def test_every_field_is_documented_and_has_its_length(joints: int, dimension: in
             column.meaning[0].isupper() or not column.meaning[0].isalpha() or "(" in column.meaning
         )
         assert dtype[name].shape == lengths[column.axis]
+
+
+@pytest.mark.parametrize(("joints", "dimension"), [(1, 2), (3, 2), (16, 3)])
+def test_numbers_packed_in_order_are_the_row(joints: int, dimension: int) -> None:
+    dtype = row_dtype(joints, dimension)
+    packer = row_struct(dtype)
+    assert packer.size == dtype.itemsize
+    row = np.zeros(1, dtype)
+    numbers: list[float] = []
+    for name in dtype.names:
+        count = dtype[name].shape[0] if dtype[name].shape else 1
+        values = list(range(len(numbers), len(numbers) + count))
+        row[name] = values if dtype[name].shape else values[0]
+        numbers += values
+    assert packer.pack(*numbers) == row.tobytes()
 
 
 def test_rows_are_packed_and_little_endian() -> None:

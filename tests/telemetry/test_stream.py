@@ -155,7 +155,7 @@ def test_what_is_published_is_in_order_and_what_is_not_is_counted(
 
 def test_a_row_of_the_wrong_shape_is_refused_and_not_counted() -> None:
     stream = stream_to([])
-    with pytest.raises(ValueError, match="broadcast"):
+    with pytest.raises(struct.error):
         stream.put(**fields_of(0) | {"q": np.zeros(4)})
     assert stream.count == 0
 

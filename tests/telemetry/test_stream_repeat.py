@@ -17,7 +17,7 @@ def put_ones(stream: TelemetryStream) -> None:
     length = {"scalar": (), "joint": (3,), "task": (2,), "reason": (12,)}
     stream.put(
         **{
-            name: np.ones(length[column.axis])
+            name: np.ones(length[column.axis], column.format)
             for name, column in COLUMNS.items()
             if name != "sequence"
         }
