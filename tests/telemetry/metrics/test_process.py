@@ -16,7 +16,7 @@ from telemetry.companion import SharedMemory
 from telemetry.metrics.process import MetricsProcess
 from telemetry.rows import COLUMNS, TelemetryError
 from telemetry.stream import TelemetryStream
-from tests.telemetry.test_metrics import LENGTHS, OPTIONS
+from tests.telemetry.metrics.test_site_metrics import LENGTHS, OPTIONS
 
 DEADLINE_S = 30.0
 
