@@ -43,7 +43,7 @@ class Run:
 
     def put(self, rows: int) -> None:
         row = {
-            name: np.zeros(LENGTHS[column.axis])
+            name: np.zeros(LENGTHS[column.axis], column.format)
             for name, column in COLUMNS.items()
             if name != "sequence"
         }

@@ -50,7 +50,7 @@ class Site:
     def put(self, **fields: Any) -> None:
         """One row: zeros, where nothing else is said."""
         row = {
-            name: np.zeros(LENGTHS[column.axis])
+            name: np.zeros(LENGTHS[column.axis], column.format)
             for name, column in COLUMNS.items()
             if name != "sequence"
         }
