@@ -56,7 +56,8 @@ def record(
                 recorded = recorder.close()
                 for notice in recorder.notices():
                     _say(notice)
-        _tell_strangers(feed.foreign, feed.broken)
+        for line in _Strangers(feed).new():
+            _say(line)
     for run in recorded:
         OUT.print(_summary(run), soft_wrap=True, highlight=False)
     if not recorded:
@@ -76,16 +77,13 @@ def _folder(session: Session, out: Path | None, force: bool) -> Path:
 
 
 def _record(feed: Feed, recorder: NetworkRecorder, signals: StopSignals) -> None:
-    told, hearing = False, _Hearing()
+    strangers, hearing = _Strangers(feed), _Hearing()
     while not signals.asked_to_stop():
         for batch, arrival_ns in feed.receive():
             recorder.offer(batch, arrival_ns)
             hearing.heard(SiteId(batch.site))
-        for notice in (*recorder.notices(), *hearing.changes()):
+        for notice in (*recorder.notices(), *hearing.changes(), *strangers.new()):
             _say(notice)
-        if (feed.foreign or feed.broken) and not told:
-            told = True
-            _tell_strangers(feed.foreign, feed.broken)
         time.sleep(POLL_S)
 
 
@@ -114,11 +112,22 @@ class _Hearing:
         return told
 
 
-def _tell_strangers(foreign: int, broken: int) -> None:
-    if foreign:
-        _say(f"{foreign} batches were of another session file and not recorded")
-    if broken:
-        _say(f"{broken} payloads were no telemetry of this version and not recorded")
+class _Strangers:
+    """What came and is not recorded; each kind is new once."""
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+        self._told: set[str] = set()
+
+    def new(self) -> list[str]:
+        """Return what there is to tell for the first time, with its count up to now."""
+        counts = {
+            "batches were of another session file and not recorded": self._feed.foreign,
+            "payloads were no telemetry of this version and not recorded": self._feed.broken,
+        }
+        new = {what: count for what, count in counts.items() if count and what not in self._told}
+        self._told |= new.keys()
+        return [f"{count} {what}" for what, count in new.items()]
 
 
 def _summary(run: Recorded) -> str:

@@ -10,8 +10,8 @@ from site_runtime.session import Session
 from site_runtime.site import Site
 from site_runtime.supervisor import State
 from telemetry.companion import SharedMemory
-from telemetry.metrics import MetricsOptions
-from telemetry.metrics_process import MetricsProcess
+from telemetry.metrics.process import MetricsProcess
+from telemetry.metrics.site_metrics import MetricsOptions
 
 LOOPBACK = "127.0.0.1"
 _ADDRESS = re.compile(r"(?:(?:\[(?P<v6>[^][]+)\]|(?P<host>[^][:]+)):)?(?P<port>[0-9]{1,5})")

@@ -49,6 +49,7 @@ class Sites:
         self._node = ZenohNode(ZenohSettings(listen=(self.endpoint,)))
         self._publish = [self._node.publisher(telemetry_key(session.name, s)) for s in SiteId]
         self.skipped: list[int] = []
+        self.strangers = False
         self._skip = 0
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._go)
@@ -58,12 +59,6 @@ class Sites:
         """Lose the next batch of the local site."""
         self._skip += 1
 
-    def say(self, data: bytes) -> None:
-        self._publish[0](data)
-
-    def foreign(self) -> bytes:
-        return payload(self._rows[0][:BATCH], SiteId.LOCAL, self._session.digest ^ 1)
-
     def close(self) -> None:
         self._ending.set()
         self._thread.join()
@@ -72,6 +67,9 @@ class Sites:
     def _go(self) -> None:
         first = 0
         while not self._ending.wait(0.02):
+            if self.strangers:
+                self._publish[0](payload(self._rows[0][:BATCH], SiteId.LOCAL, 1))
+                self._publish[0](b"what is this")
             for site, rows in zip(SiteId, self._rows, strict=True):
                 part = rows[first % 1000 :][:BATCH].copy()
                 part["sequence"] += first - first % 1000
@@ -133,8 +131,7 @@ def test_both_sites_are_recorded_and_gaps_and_strangers_told(
         until(lambda: len(list(out.glob("*.mcap"))) == 2)
         time.sleep(0.3)
         sites.skip()
-        sites.say(sites.foreign())
-        sites.say(b"what is this")
+        sites.strangers = True  # again and again: on a crowded machine what is published may drop
         said = wait_for(process, "rows lost", "another session file", "no telemetry")
         process.send_signal(signal.SIGINT)
         said += process.communicate(timeout=DEADLINE_S)[0]
@@ -143,8 +140,8 @@ def test_both_sites_are_recorded_and_gaps_and_strangers_told(
     assert process.returncode == 0, said
     lost = f"50 rows lost from row {sites.skipped[0]} on"
     assert f"local: {lost}" in said
-    assert "1 batches were of another session file and not recorded" in said
-    assert "1 payloads were no telemetry of this version and not recorded" in said
+    assert re.search(r"\d+ batches were of another session file and not recorded", said)
+    assert re.search(r"\d+ payloads were no telemetry of this version and not recorded", said)
     runs = {run.metadata["site"]: run for run in recorded_runs(recording_files([out]))}
     assert set(runs) == {"local", "remote"}
     for site, run in runs.items():
@@ -212,9 +209,11 @@ def test_a_folder_that_holds_recordings_is_added_to_only_by_force(tmp_path: Path
     (tmp_path / "rows-x-local.mcap").touch()
     wish = (DEMO, "--out", tmp_path, "--duration", "0.2", "--connect", "tcp/127.0.0.1:1")
     result = record(*wish)
-    assert result.exit_code == 2
+    assert result.exit_code == 2, result.output
     assert "--force" in result.output
-    assert record(*wish, "--force").exit_code == 1  # and nothing was heard
+    forced = record(*wish, "--force")
+    assert forced.exit_code == 1, forced.output
+    assert "nothing was recorded" in forced.output
 
 
 def test_a_place_that_cannot_be_written_is_told_at_once(tmp_path: Path) -> None:

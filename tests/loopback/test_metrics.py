@@ -124,7 +124,7 @@ class Daemon:
         [pid] = [
             int(pid)
             for pid in children.read_text(encoding="ascii").split()
-            if b"telemetry.metrics_server" in Path(f"/proc/{pid}/cmdline").read_bytes()
+            if b"telemetry.metrics.server" in Path(f"/proc/{pid}/cmdline").read_bytes()
         ]
         return pid
 

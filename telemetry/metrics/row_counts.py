@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from telemetry.histogram import Histogram
+from telemetry.metrics.histogram import Histogram
 from telemetry.rows import NO_PEER_STATE, RowArray
 
 # 1 kHz is 1 ms, 4 kHz 0.25 ms: finest around a tick's length

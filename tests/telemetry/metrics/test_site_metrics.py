@@ -10,8 +10,8 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from telemetry.metrics import MetricsOptions, SiteMetrics
-from telemetry.row_counts import STAGES
+from telemetry.metrics.row_counts import STAGES
+from telemetry.metrics.site_metrics import MetricsOptions, SiteMetrics
 from telemetry.row_ring import RecorderStatus
 from telemetry.rows import COLUMNS, NO_PEER_STATE, REJECT_REASONS, RowArray
 from telemetry.stream import TelemetryStream
@@ -50,7 +50,7 @@ class Site:
     def put(self, **fields: Any) -> None:
         """One row: zeros, where nothing else is said."""
         row = {
-            name: np.zeros(LENGTHS[column.axis])
+            name: np.zeros(LENGTHS[column.axis], column.format)
             for name, column in COLUMNS.items()
             if name != "sequence"
         }

@@ -5,10 +5,10 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from telemetry.companion import Companion, SharedMemory
-from telemetry.metrics import MetricsOptions
+from telemetry.metrics.site_metrics import MetricsOptions
 from telemetry.rows import TelemetryError
 
-_MODULE: Final = "telemetry.metrics_server"
+_MODULE: Final = "telemetry.metrics.server"
 _START_S: Final = 15.0
 _END_S: Final = 1.0
 

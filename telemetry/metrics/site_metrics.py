@@ -13,8 +13,8 @@ import numpy as np
 from prometheus_client import Metric
 from prometheus_client.registry import Collector
 
-from telemetry.metric_families import MetricFamilies
-from telemetry.row_counts import RowCounts
+from telemetry.metrics.families import MetricFamilies
+from telemetry.metrics.row_counts import RowCounts
 from telemetry.row_ring import RowRing
 from telemetry.rows import REJECT_REASONS
 

@@ -13,10 +13,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from telemetry.companion import SharedMemory
-from telemetry.metrics_process import MetricsProcess
+from telemetry.metrics.process import MetricsProcess
 from telemetry.rows import COLUMNS, TelemetryError
 from telemetry.stream import TelemetryStream
-from tests.telemetry.test_metrics import LENGTHS, OPTIONS
+from tests.telemetry.metrics.test_site_metrics import LENGTHS, OPTIONS
 
 DEADLINE_S = 30.0
 
@@ -43,7 +43,7 @@ class Run:
 
     def put(self, rows: int) -> None:
         row = {
-            name: np.zeros(LENGTHS[column.axis])
+            name: np.zeros(LENGTHS[column.axis], column.format)
             for name, column in COLUMNS.items()
             if name != "sequence"
         }
@@ -133,6 +133,6 @@ def test_an_address_of_another_machine_is_told_at_the_start() -> None:
 
 
 def test_one_that_cannot_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("telemetry.metrics_process._MODULE", "telemetry.absent")
+    monkeypatch.setattr("telemetry.metrics.process._MODULE", "telemetry.absent")
     with pytest.raises(TelemetryError, match="their process ended at once"):
         Run()

@@ -1,4 +1,4 @@
-"""A site's Prometheus endpoint, in a process of its own: `python -m telemetry.metrics_server`.
+"""A site's Prometheus endpoint, in a process of its own: `python -m telemetry.metrics.server`.
 
 It reads one site's rows from shared memory, as the recorder does. The first line of its standard
 input tells what to do; it answers with one line and ends with the site.
@@ -12,7 +12,7 @@ from typing import Final
 from prometheus_client import CollectorRegistry, start_http_server
 
 from telemetry.companion import input_ended, stand_back
-from telemetry.metrics import MetricsOptions, SiteMetrics
+from telemetry.metrics.site_metrics import MetricsOptions, SiteMetrics
 from telemetry.row_ring import RowRing
 
 UPDATE_S: Final = 0.5  # a small part of the time that the ring holds

@@ -9,7 +9,7 @@ from prometheus_client.metrics_core import (
     HistogramMetricFamily,
 )
 
-from telemetry.histogram import Histogram
+from telemetry.metrics.histogram import Histogram
 
 
 class MetricFamilies:
