@@ -24,7 +24,8 @@ def user_errors() -> Iterator[None]:
     try:
         yield
     except (SessionError, HardwareError, LinkError, TelemetryError, RunnerError, OSError) as error:
-        ERR.print(str(error), style="red", highlight=False, markup=False)
+        # soft: a path is there to be copied
+        ERR.print(str(error), style="red", highlight=False, markup=False, soft_wrap=True)
         raise typer.Exit(EXIT_USER_ERROR) from None
 
 

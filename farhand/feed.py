@@ -9,7 +9,7 @@ from site_runtime.session import Session
 from telemetry.rows import TelemetryError
 from telemetry.stream import Batch, decode_batch
 
-_CAPACITY = 2000  # batches: well over half a minute of both sites
+_CAPACITY = 4000  # batches: well over half a minute of both sites
 
 
 class Feed:

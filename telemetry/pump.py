@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 PERIOD_S: Final = 0.05
 """The least time from one call of the consumer to the next."""
-CAPACITY: Final = 400
+CAPACITY: Final = 800
 
 
 class Pump(Generic[T]):

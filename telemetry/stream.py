@@ -16,7 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 
 MAGIC: Final = b"FHTB"
 MAX_BATCH_ROWS: Final = 10_000
-RING_BATCHES: Final = 240  # at 1 kHz, 12 s for a recorder that is held up
+RING_BATCHES: Final = 480  # at 1 kHz, 12 s for a recorder that is held up
 _MOST: Final = 2**32 - 1  # that a counter's column holds
 FAREWELL: Final = "farewell"
 """The last event of a site that ended in good order."""
@@ -43,7 +43,7 @@ class Batch:
 class TelemetryStream:
     """The producer's side: `put` in the tick, `flush` in the slack after it, one thread.
 
-    A ring of 240 batches of rows is allocated once, by `allocate` if a recorder is to read it;
+    A ring of 480 batches of rows is allocated once, by `allocate` if a recorder is to read it;
     `publish` gets each full batch as bytes and must not block. Rows overwritten before they were
     flushed are lost and counted.
     """
@@ -56,7 +56,7 @@ class TelemetryStream:
         session_digest: int,
         epoch: int,
         publish: Callable[[bytes], None],
-        batch_rows: int = 50,
+        batch_rows: int = 25,
         allocate: Callable[[int], Memory] = bytearray,
     ) -> None:
         if not 1 <= batch_rows <= MAX_BATCH_ROWS:

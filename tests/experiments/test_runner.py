@@ -74,7 +74,7 @@ def here(monkeypatch: pytest.MonkeyPatch, expected: dict[str, bytes]) -> Here:
 def cluster() -> Iterator[LocalCluster]:
     """A dask scheduler with two worker processes."""
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
     ) as started:
         yield started
 

@@ -73,7 +73,7 @@ def _rise(
 ) -> tuple[float, float]:
     """Greatest rise of V above its least value before, and its greatest value [J]."""
     windows_s = []
-    for rows in (local, remote):
+    for rows in (remote, local):  # d̄_l is the age of the local samples, which the remote site tells
         during = (rows["stamp_ns"] >= grid_ns[0]) & (rows["stamp_ns"] <= grid_ns[-1])
         windows_s.append(float(rows["one_way_delay_s"][during].max()) + session.period_ns * 1e-9)
     # V₃ looks back: what moved before the interval is in it
