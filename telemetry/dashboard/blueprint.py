@@ -52,7 +52,7 @@ def blueprint(picture: Picture, extent: Extent) -> rrb.Blueprint:
     if picture.meter is not None:
         middle += [
             plot("energy", "Energy of the proof [J] · thin: its parts"),
-            plot("work", "Energy put in [J] · pale: taken out by damping"),
+            plot("exchange", "Energy put in [J] · pale: taken out by damping"),
         ]
     right = [
         plot("margin", "Margin of the certificate [ms]", _margin_range(picture)),

@@ -42,9 +42,8 @@ class Energies:
         series(canvas, "energy/parts", list(_PARTS), list(_PARTS.values()))
         for view, by in zip(picture.sites, ("hand", "environment"), strict=True):
             names = [f"put in by the {by}", f"taken by {view.name} damping"]
-            series(
-                canvas, f"work/{view.name}", names, [view.colour, blend(view.colour, WHITE, 0.6)]
-            )
+            colours = [view.colour, blend(view.colour, WHITE, 0.6)]
+            series(canvas, f"exchange/{view.name}", names, colours)
 
     def draw(self, until_ns: int, *, everything: bool) -> None:
         """Draw up to this time [ns], as far as both sites have been heard; maybe later."""
@@ -70,4 +69,4 @@ class Energies:
         self._canvas.plot("energy/parts", trace.times_ns, trace.functional_j)
         for site, name in enumerate(self._names):
             work_j = trace.injected_j[:, site], trace.dissipated_j[:, site]
-            self._canvas.plot(f"work/{name}", trace.times_ns, *work_j)
+            self._canvas.plot(f"exchange/{name}", trace.times_ns, *work_j)

@@ -126,7 +126,7 @@ def test_what_the_energy_meter_says_is_recorded(run: Any, recording: Recording) 
     assert parts == pytest.approx(expected, abs=1e-9)
     assert scalars(recording, "/energy/V")[1][:, 0] == pytest.approx(expected.sum(axis=1), abs=1e-9)
     for name, position_m in (("local", local_m), ("remote", remote_m)):
-        work_ns, work = scalars(recording, f"/work/{name}")
+        work_ns, work = scalars(recording, f"/exchange/{name}")
         assert np.array_equal(work_ns, times_ns)
         assert work == pytest.approx(position_m, abs=1e-9)
 
@@ -136,7 +136,7 @@ def test_without_a_meter_no_energy_is_drawn(run: Any, chain: Chain, tmp_path: Pa
     save_recording(tmp_path / "run.rrd", picture, run.batches(PASSAGES_NS)[:20])
     recorded = read(tmp_path / "run.rrd")
     assert "/torque/local" in recorded
-    assert not [path for path in recorded if path.startswith(("/energy", "/work"))]
+    assert not [path for path in recorded if path.startswith(("/energy", "/exchange"))]
 
 
 def test_the_panels_are_written_again_for_viewers_that_come_late(recording: Recording) -> None:
