@@ -106,6 +106,14 @@ def test_nothing_is_used_before_the_peer_has_answered() -> None:
     assert remote.peer_confirmed
 
 
+def test_a_sample_tells_when_it_arrived_however_long_it_has_been_in_use() -> None:
+    wire = Wire()
+    for now_ms in (7, 8, 20):
+        sample = wire.hear(now_ms * MS, *([wire.packet()] if now_ms == 7 else []))
+        assert sample is not None
+        assert sample.arrival_ns == 7 * MS
+
+
 @pytest.mark.parametrize("mode", ["exact", "added"])
 @pytest.mark.parametrize("shared_clock", [True, False])
 def test_round_trip_is_the_sum_of_the_delays(mode: DelayMode, shared_clock: bool) -> None:
