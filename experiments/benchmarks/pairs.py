@@ -1,0 +1,119 @@
+"""More pairs of sites on one machine, each meeting by itself or all through one router."""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from experiments.benchmarks.figures import Benchmark, Effort, Goal, Row, Spread
+from experiments.benchmarks.hand_to_hand import hand_to_hand_us, latencies
+from experiments.benchmarks.router import Router, routing
+from experiments.benchmarks.sites import NO_DELAY, Sites
+from experiments.benchmarks.usage import family, usage_of
+from site_runtime.keys import SiteId
+
+_RATE_HZ = 100  # so that eight pairs find room on two cores
+_MOST_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Of so many pairs: processor time of each [% of a core], lateness and hand to hand [µs]."""
+
+    pairs: int
+    cpu_percent: float
+    lateness_us: npt.NDArray[np.float64]
+    hand_to_hand_us: npt.NDArray[np.float64]
+
+
+def measure(effort: Effort) -> Iterator[Row]:
+    """Run one pair and more of them, first directly, then through a router."""
+    seconds = min(effort.seconds, _MOST_S)
+    yield from _rows([_run(n, seconds, None) for n in effort.pairs], "each meeting directly")
+    found = []
+    for pairs in effort.pairs:
+        with routing() as router:
+            found.append(_run(pairs, seconds, router))
+    yield from _rows(found, "all through one router, its time counted")
+
+
+def _run(pairs: int, seconds: float, router: Router | None) -> _Found:
+    with ExitStack() as stack:
+        running = [
+            stack.enter_context(
+                Sites(
+                    f"bench-pair-{number}",
+                    {"loop.rate_hz": _RATE_HZ, **NO_DELAY},
+                    options=("--no-record",),
+                    config_files=None if router is None else router.config_files,
+                    through=None if router is None else router.endpoint,
+                )
+            )
+            for number in range(pairs)
+        ]
+        for sites in running:
+            sites.until_engaged()
+        pids = [pid for sites in running for site in SiteId for pid in family(sites.pid(site))]
+        pids += [] if router is None else [router.pid]
+        before_s, start_s = usage_of(pids).cpu_s, time.monotonic()
+        time.sleep(seconds)
+        took_s = time.monotonic() - start_s
+        used_s = usage_of(pids).cpu_s - before_s
+        heard = [sites.heard_since(round(start_s * 1e9)) for sites in running]
+    return _Found(
+        pairs,
+        100.0 * used_s / took_s / pairs,
+        np.concatenate([rows["lateness_ns"] for both in heard for rows in both.values()]) * 1e-3,
+        np.concatenate(
+            [
+                hand_to_hand_us(latencies(both[site], both[site.peer]))
+                for both in heard
+                for site in SiteId
+            ]
+        ),
+    )
+
+
+def _rows(found: list[_Found], how: str) -> Iterator[Row]:
+    one, most = found[0], found[-1]
+    yield Row(
+        what=f"processor time a pair, {most.pairs} pairs at {_RATE_HZ} Hz, {how}",
+        against=f"that of {one.pairs}",
+        unit="% of a core",
+        ours=Spread.of([most.cpu_percent]),
+        yardstick=Spread.of([one.cpu_percent]),
+        goals=(Goal("linear: a pair's share", most.cpu_percent / one.cpu_percent, 1.2, 1.1),),
+        notes=tuple(_told(each) for each in found),
+    )
+    for name, pick in (("wake-up lateness", _lateness), ("hand to hand", _hand_to_hand)):
+        yield Row(
+            what=f"{name}, {most.pairs} pairs at {_RATE_HZ} Hz, {how}",
+            against=f"that of {one.pairs}",
+            unit="µs",
+            ours=Spread.of(pick(most)),
+            yardstick=Spread.of(pick(one)),
+            goals=(),
+        )
+
+
+def _lateness(found: _Found) -> npt.NDArray[np.float64]:
+    return found.lateness_us
+
+
+def _hand_to_hand(found: _Found) -> npt.NDArray[np.float64]:
+    return found.hand_to_hand_us
+
+
+def _told(found: _Found) -> str:
+    late, hand = Spread.of(found.lateness_us), Spread.of(found.hand_to_hand_us)
+    return (
+        f"{found.pairs}: {found.cpu_percent:.1f} % a pair; lateness p50 {late.p50:.0f}, "
+        f"p99 {late.p99:.0f}, p99.9 {late.p999:.0f} µs; hand to hand p50 {hand.p50:.0f}, "
+        f"p99 {hand.p99:.0f}, p99.9 {hand.p999:.0f} µs"
+    )
+
+
+PAIRS = Benchmark("pairs", "pairs of sites on one machine, directly and through a router", measure)
