@@ -119,14 +119,8 @@ class RobotModel:
 
     def terms(self, q: FloatArray, q_dot: FloatArray) -> RobotTerms:
         """Return everything a tick needs at joint positions q (n,) and velocities q̇ (n,)."""
-        model, data, z = self._model, self._data, self.task_dimension
-        pin.crba(model, data, q)
-        pin.computeGeneralizedGravity(model, data, q)
-        pin.computeCoriolisMatrix(model, data, q, q_dot)  # last: leaves placements, J and J̇
-        pin.updateFramePlacement(model, data, self._frame)
-        frame_axes = pin.LOCAL_WORLD_ALIGNED
-        J = pin.getFrameJacobian(model, data, self._frame, frame_axes)
-        J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame, frame_axes)
+        z = self.task_dimension
+        J, J_dot = self.compute(q, q_dot)
         J, J_dot = J.reshape(6, -1)[:z], J_dot.reshape(6, -1)[:z]
         origins = np.array(self._points)
         axes = self._axes.copy()
@@ -145,6 +139,18 @@ class RobotModel:
             origins_dot=_origins_dot(origins, axes, q_dot),
             axes=axes,
             axes_dot=self._axes_dot.copy(),
+        )
+
+    def compute(self, q: FloatArray, q_dot: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Let pinocchio work out all that `terms` reads; return the frame's J and J̇, (6, n)."""
+        model, data, frame = self._model, self._data, self._frame
+        pin.crba(model, data, q)
+        pin.computeGeneralizedGravity(model, data, q)
+        pin.computeCoriolisMatrix(model, data, q, q_dot)  # last: leaves placements, J and J̇
+        pin.updateFramePlacement(model, data, frame)
+        return (
+            pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED),
+            pin.getFrameJacobianTimeVariation(model, data, frame, pin.LOCAL_WORLD_ALIGNED),
         )
 
     def end_effector(
