@@ -2,6 +2,7 @@
 
 import typer
 
+from farhand.bench import bench
 from farhand.certify import certify
 from farhand.commission import commission_quanser
 from farhand.dashboard import dashboard
@@ -41,6 +42,7 @@ for command in (
     certify,
     design,
     reproduce,
+    bench,
     devices,
     device_check,
     commission_quanser,

@@ -118,7 +118,9 @@ class Sleeper:
         _run([compiler, "-O2", "-o", str(self._program), str(source)], 0.0)
 
 
-def _samples(told: dict[str, dict[str, dict[str, dict[str, int] | int]]]) -> npt.NDArray[np.float64]:
+def _samples(
+    told: dict[str, dict[str, dict[str, dict[str, int] | int]]],
+) -> npt.NDArray[np.float64]:
     thread = told["thread"]["0"]
     histogram, cycles = thread["histogram"], thread["cycles"]
     assert isinstance(histogram, dict)  # noqa: S101 - by cyclictest's format

@@ -131,6 +131,17 @@ class Sites:
                 log = self._log(site).read_text(encoding="utf-8", errors="replace").strip()
                 raise BenchmarkError(f"the {site.label} site ended by itself: {log[-300:]}")
 
+    def until_heard(self, patience_s: float = _PATIENCE_S) -> None:
+        """Wait until both have told something; BenchmarkError if that takes longer."""
+        end_s = time.monotonic() + patience_s
+        mute = set(SiteId)
+        while mute:
+            if time.monotonic() > end_s:
+                told = " and ".join(site.label for site in mute)
+                raise BenchmarkError(f"not heard within {patience_s:.0f} s: {told}")
+            time.sleep(_POLL_S)
+            mute -= {site for site, batches in self._collect().items() if batches}
+
     def until_engaged(self, patience_s: float = _PATIENCE_S) -> None:
         """Wait until both have had full force for a second; BenchmarkError if that takes longer."""
         end_s = time.monotonic() + patience_s

@@ -25,7 +25,9 @@ def usage_of(pids: Iterable[int]) -> Usage:
     for pid in pids:
         try:
             # after the name, which may hold spaces; see proc_pid_stat(5)
-            fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            fields = (
+                Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            )
         except OSError as error:
             raise BenchmarkError(f"process {pid} is gone") from error
         cpu_ticks += int(fields[11]) + int(fields[12])
