@@ -119,7 +119,7 @@ class Effort:
 
 FULL = Effort(60.0, 6, (1000, 2000, 4000), 600.0, (1, 2, 4, 8))
 QUICK = Effort(5.0, 2, (1000, 2000, 4000), 20.0, (1, 4))
-BRIEF = Effort(1.0, 1, (1000,), 2.0, (1, 2))
+BRIEF = Effort(1.0, 1, (1000,), 1.0, (1, 2))
 """For the tests: that every figure can be measured, not what it is."""
 
 

@@ -36,41 +36,53 @@ class _Found:
 
 def measure(effort: Effort) -> Iterator[Row]:
     """Run one pair and more of them, first directly, then through a router."""
-    seconds = min(effort.seconds, _MOST_S)
-    yield from _rows([_run(n, seconds, None) for n in effort.pairs], "each meeting directly")
-    found = []
-    for pairs in effort.pairs:
-        with routing() as router:
-            found.append(_run(pairs, seconds, router))
-    yield from _rows(found, "all through one router, its time counted")
+    yield from _rows(_run(effort, None), "each meeting directly")
+    yield from through_router(effort)
 
 
-def _run(pairs: int, seconds: float, router: Router | None) -> _Found:
+def through_router(effort: Effort) -> Iterator[Row]:
+    """Run one pair and more of them that all meet at one router."""
+    with routing() as router:
+        yield from _rows(_run(effort, router), "all through one router, its time counted")
+
+
+def _run(effort: Effort, router: Router | None) -> list[_Found]:
+    """Start pairs beside those that run, and measure as often as `effort` asks."""
+    found: list[_Found] = []
+    running: list[Sites] = []
     with ExitStack() as stack:
-        running = [
-            stack.enter_context(
-                Sites(
-                    f"bench-pair-{number}",
-                    {"loop.rate_hz": _RATE_HZ, **NO_DELAY},
-                    options=("--no-record",),
-                    config_files=None if router is None else router.config_files,
-                    through=None if router is None else router.endpoint,
-                )
-            )
-            for number in range(pairs)
-        ]
-        for sites in running:
-            sites.until_engaged()
-        pids = [pid for sites in running for site in SiteId for pid in family(sites.pid(site))]
-        pids += [] if router is None else [router.pid]
-        before_s, start_s = usage_of(pids).cpu_s, time.monotonic()
-        time.sleep(seconds)
-        took_s = time.monotonic() - start_s
-        used_s = usage_of(pids).cpu_s - before_s
-        heard = [sites.heard_since(round(start_s * 1e9)) for sites in running]
+        for pairs in effort.pairs:
+            running += [
+                stack.enter_context(_pair(number, router))
+                for number in range(len(running), pairs)
+            ]
+            for sites in running:
+                sites.until_engaged()
+            found.append(_watch(running, min(effort.seconds, _MOST_S), router))
+    return found
+
+
+def _pair(number: int, router: Router | None) -> Sites:
+    return Sites(
+        f"bench-pair-{number}",
+        {"loop.rate_hz": _RATE_HZ, **NO_DELAY},
+        options=("--no-record",),
+        config_files=None if router is None else router.config_files,
+        through=None if router is None else router.endpoint,
+    )
+
+
+def _watch(running: list[Sites], seconds: float, router: Router | None) -> _Found:
+    pids = [pid for sites in running for site in SiteId for pid in family(sites.pid(site))]
+    pids += [] if router is None else [router.pid]
+    before_s, start_ns = usage_of(pids).cpu_s, time.monotonic_ns()
+    time.sleep(seconds)
+    took_s = (time.monotonic_ns() - start_ns) * 1e-9
+    used_s = usage_of(pids).cpu_s - before_s
+    heard = [sites.heard_since(start_ns) for sites in running]
     return _Found(
-        pairs,
-        100.0 * used_s / took_s / pairs,
+        len(running),
+        100.0 * used_s / took_s / len(running),
         np.concatenate([rows["lateness_ns"] for both in heard for rows in both.values()]) * 1e-3,
         np.concatenate([_beyond_us(both, site) for both in heard for site in SiteId]),
     )

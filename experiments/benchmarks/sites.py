@@ -32,7 +32,7 @@ LONGEST_S = 1800.0
 """After which a daemon ends by itself, should whoever started it be killed."""
 
 _PATIENCE_S = 60.0
-_STEADY_S = 1.0  # under full force
+_STEADY_S = 0.5  # under full force
 _POLL_S = 0.25
 _BATCHES = 4000
 _BATCH_S = 0.3
@@ -143,7 +143,7 @@ class Sites:
             mute -= {site for site, batches in self._collect().items() if batches}
 
     def until_engaged(self, patience_s: float = _PATIENCE_S) -> None:
-        """Wait until both have had full force for a second; BenchmarkError if that takes longer."""
+        """Wait until both have had full force for a while; BenchmarkError if that takes longer."""
         end_s = time.monotonic() + patience_s
         since_s: dict[SiteId, float] = {}
         states: dict[SiteId, str] = {}
