@@ -6,35 +6,43 @@ from math import inf, sqrt
 import numpy as np
 import numpy.typing as npt
 
-from control_law.sub_tasks.chain import Vector, center_3d, dot, minus, plus
+from control_law.sub_tasks.chain import center_3d
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def closest_parameter(start: Vector, link: Vector, center: Vector) -> float:
-    """Return λ in [0, 1] that brings start + λ·link nearest to the centre."""
-    length2 = dot(link, link)
+def closest_parameter(sx: float, sy: float, sz: float, lx: float, ly: float, lz: float) -> float:
+    """Return λ in [0, 1] that brings s + λl nearest to 0: s a link's start from a centre, l it."""
+    length2 = lx * lx + ly * ly + lz * lz
     if length2 == 0.0:  # two joint centres may coincide
         return 0.0
-    return min(max(dot(link, minus(center, start)) / length2, 0.0), 1.0)
+    along = -(lx * sx + ly * sy + lz * sz) / length2
+    return 0.0 if along <= 0.0 else min(along, 1.0)
+
+
+def distances(origins: FloatArray, center: FloatArray) -> tuple[float, float]:
+    """Return the distance [m] from a centre to the links, and to the nearest link midpoint.
+
+    The links go through `origins` (n+1, 3); midpoints are the paper's measure.
+    """
+    cx, cy, cz = center_3d(center)
+    link2 = midpoint2 = inf
+    for (ax, ay, az), (bx, by, bz) in pairwise(origins.tolist()):
+        lx, ly, lz = bx - ax, by - ay, bz - az
+        sx, sy, sz = ax - cx, ay - cy, az - cz
+        along = closest_parameter(sx, sy, sz, lx, ly, lz)
+        ox, oy, oz = sx + along * lx, sy + along * ly, sz + along * lz
+        link2 = min(link2, ox * ox + oy * oy + oz * oz)
+        ox, oy, oz = sx + 0.5 * lx, sy + 0.5 * ly, sz + 0.5 * lz
+        midpoint2 = min(midpoint2, ox * ox + oy * oy + oz * oz)
+    return sqrt(link2), sqrt(midpoint2)
 
 
 def segment_distance(origins: FloatArray, center: FloatArray) -> float:
     """Return the distance [m] from the chain's links, through origins (n+1, 3), to the centre."""
-    target, points = center_3d(center), origins.tolist()
-    least = inf
-    for start, end in pairwise(points):
-        link = minus(end, start)
-        offset = minus(plus(start, link, closest_parameter(start, link, target)), target)
-        least = min(least, dot(offset, offset))
-    return sqrt(least)
+    return distances(origins, center)[0]
 
 
 def midpoint_distance(origins: FloatArray, center: FloatArray) -> float:
     """Return the distance [m] from the nearest link midpoint to the centre, the paper's measure."""
-    target, points = center_3d(center), origins.tolist()
-    least = inf
-    for start, end in pairwise(points):
-        offset = minus(plus(start, minus(end, start), 0.5), target)
-        least = min(least, dot(offset, offset))
-    return sqrt(least)
+    return distances(origins, center)[1]
