@@ -53,8 +53,7 @@ def _run(effort: Effort, router: Router | None) -> list[_Found]:
     with ExitStack() as stack:
         for pairs in effort.pairs:
             running += [
-                stack.enter_context(_pair(number, router))
-                for number in range(len(running), pairs)
+                stack.enter_context(_pair(number, router)) for number in range(len(running), pairs)
             ]
             for sites in running:
                 sites.until_engaged()

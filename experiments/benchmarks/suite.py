@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from experiments.benchmarks.faster_than_real_time import SIMULATE
 from experiments.benchmarks.figures import Benchmark, BenchmarkError, Effort, Row, Unmeasured
 from experiments.benchmarks.hand_to_hand import HAND_TO_HAND
 from experiments.benchmarks.machine import describe_machine, load_average, processor_times
@@ -22,6 +23,7 @@ BENCHMARKS: tuple[Benchmark, ...] = (
     WAKE_UP,
     MISSED,
     HAND_TO_HAND,
+    SIMULATE,
     STEADY,
     PAIRS,
 )
