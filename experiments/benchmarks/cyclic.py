@@ -70,12 +70,19 @@ class Sleeper:
 
     def __init__(self) -> None:
         self._cyclictest = shutil.which("cyclictest")
-        self._folder = TemporaryDirectory(prefix="farhand-bench-")
+        self._compiler = shutil.which("cc")
         self.name = "cyclictest" if self._cyclictest else "a C loop (no cyclictest here)"
 
     def __enter__(self) -> "Sleeper":
-        if self._cyclictest is None:
-            self._compile()
+        if self._cyclictest is None and self._compiler is None:
+            raise BenchmarkError(
+                "needs cyclictest (Debian's rt-tests), or a C compiler for its stand-in"
+            )
+        self._folder = TemporaryDirectory(prefix="farhand-bench-")
+        if self._cyclictest is None and self._compiler is not None:
+            source = self._program.with_suffix(".c")
+            source.write_text(_SOURCE, encoding="utf-8")
+            _run([self._compiler, "-O2", "-o", str(self._program), str(source)], 0.0)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -106,16 +113,6 @@ class Sleeper:
     @property
     def _program(self) -> Path:
         return Path(self._folder.name) / "sleeper"
-
-    def _compile(self) -> None:
-        compiler = shutil.which("cc")
-        if compiler is None:
-            raise BenchmarkError(
-                "needs cyclictest (Debian's rt-tests), or a C compiler for its stand-in"
-            )
-        source = self._program.with_suffix(".c")
-        source.write_text(_SOURCE, encoding="utf-8")
-        _run([compiler, "-O2", "-o", str(self._program), str(source)], 0.0)
 
 
 def _samples(

@@ -4,15 +4,17 @@ import gzip
 import os
 import platform
 import re
+import resource
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from site_runtime.real_time import RealTimeSettings, apply_real_time
-
 _ROOT = Path("/")
 _LIBRARIES = ("farhand", "numpy", "pin", "eclipse-zenoh", "mujoco")
+# linux/capability.h
+_CAPABILITIES = {"CAP_SYS_NICE": 23, "CAP_IPC_LOCK": 14}
+_LIMITS = {"rtprio": resource.RLIMIT_RTPRIO, "memlock": resource.RLIMIT_MEMLOCK}
 _PREEMPTION = ("RT", "FULL", "LAZY", "VOLUNTARY", "NONE")
 
 
@@ -49,7 +51,7 @@ def describe_machine(root: Path = _ROOT) -> dict[str, str]:
         or "none told",
         "Python": f"{platform.python_implementation()} {platform.python_version()}",
         "libraries": ", ".join(f"{name} {_version(name)}" for name in _LIBRARIES),
-        "privileges": _privileges(),
+        "privileges": _privileges(root),
     }
 
 
@@ -87,13 +89,17 @@ def _preemption(root: Path, kernel: Mapping[str, str]) -> str:
     return ", ".join(built) or "unknown"
 
 
-def _privileges() -> str:
-    with apply_real_time(RealTimeSettings("try")) as granted:
-        refused = [refusal.asked for refusal in granted.refused]
-    told = "all real-time settings granted"
-    if refused:
-        told = f"refused: {', '.join(refused)}"
-    return f"user {os.geteuid()}, {told}"
+def _privileges(root: Path) -> str:
+    capable = re.search(r"^CapEff:\s*(\w+)$", _read(root / "proc/self/status"), re.MULTILINE)
+    bits = int(capable.group(1), 16) if capable else 0
+    held = [name for name, bit in _CAPABILITIES.items() if bits >> bit & 1]
+    limits = ", ".join(f"{name} {_limit(number)}" for name, number in _LIMITS.items())
+    return f"user {os.geteuid()}, {' and '.join(held) or 'no capabilities'}, limits {limits}"
+
+
+def _limit(number: int) -> str:
+    soft, _ = resource.getrlimit(number)
+    return "unlimited" if soft == resource.RLIM_INFINITY else str(soft)
 
 
 def _version(name: str) -> str:

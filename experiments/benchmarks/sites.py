@@ -16,7 +16,6 @@ import numpy as np
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from experiments.benchmarks.figures import BenchmarkError
 from site_runtime.keys import SiteId, telemetry_key
-from site_runtime.session import load_session
 from site_runtime.session_edit import TomlValue, edited
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray, TelemetryError
@@ -55,32 +54,22 @@ class Sites:
         config_files: Mapping[SiteId, Path] | None = None,
         through: str | None = None,
     ) -> None:
-        self._folder = TemporaryDirectory(prefix="farhand-bench-")
+        self._name = name
+        self._changes = dict(changes or {})
         self._options = tuple(options)
+        self._config_files = dict(config_files or {})
         self._through = through
-        self._processes: dict[SiteId, subprocess.Popen[bytes]] = {}
         self._endpoints = {site: free_endpoint() for site in SiteId}
-        folder = Path(self._folder.name)
-        self._files = {}
-        for site in SiteId:
-            config = (config_files or {}).get(site)
-            own: dict[str, TomlValue | None] = {
-                "name": name,
-                "recorder.directory": str(folder / "recordings"),
-                "network.zenoh_config": None if config is None else str(config),
-            }
-            self._files[site] = folder / f"{site.label}.toml"
-            text = edited(DEMO.read_text(encoding="utf-8"), own | dict(changes or {}))
-            self._files[site].write_text(text, encoding="utf-8")
-        self.session = load_session(self._files[SiteId.LOCAL])
+        self._processes: dict[SiteId, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Self:
+        self._folder = TemporaryDirectory(prefix="farhand-bench-")
         try:
             for site in (SiteId.REMOTE, SiteId.LOCAL):
                 self._processes[site] = self._start(site)
             self._node = ZenohNode(ZenohSettings(connect=tuple(self._endpoints.values())))
             self._telemetry = {
-                site: self._node.subscriber(telemetry_key(self.session.name, site), _BATCHES)
+                site: self._node.subscriber(telemetry_key(self._name, site), _BATCHES)
                 for site in SiteId
             }
         except BaseException:
@@ -172,13 +161,25 @@ class Sites:
                 raise BenchmarkError(f"telemetry of the {site.label} site: {error}") from error
         return heard
 
+    def _write_session(self, site: SiteId) -> Path:
+        config = self._config_files.get(site)
+        own: dict[str, TomlValue | None] = {
+            "name": self._name,
+            "recorder.directory": str(Path(self._folder.name) / "recordings"),
+            "network.zenoh_config": None if config is None else str(config),
+        }
+        file = Path(self._folder.name) / f"{site.label}.toml"
+        text = edited(DEMO.read_text(encoding="utf-8"), own | self._changes)
+        file.write_text(text, encoding="utf-8")
+        return file
+
     def _start(self, site: SiteId) -> subprocess.Popen[bytes]:
         arguments = ["--listen", self._endpoints[site], "--duration", str(LONGEST_S), "--quiet"]
         if self._through is not None:
             arguments += ["--connect", self._through]
         elif site is SiteId.LOCAL:
             arguments += ["--connect", self._endpoints[SiteId.REMOTE]]
-        command = [sys.executable, "-m", f"{site.label}_site", str(self._files[site])]
+        command = [sys.executable, "-m", f"{site.label}_site", str(self._write_session(site))]
         with self._log(site).open("wb") as log:
             return subprocess.Popen(  # noqa: S603 - our own module
                 [*command, *arguments, *self._options],
@@ -189,7 +190,7 @@ class Sites:
             )
 
     def _log(self, site: SiteId) -> Path:
-        return self._files[site].with_suffix(".log")
+        return Path(self._folder.name) / f"{site.label}.log"
 
     def _end(self) -> None:
         for process in self._processes.values():
