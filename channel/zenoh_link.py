@@ -6,6 +6,7 @@ of ours ever competes with the control loop for the interpreter.
 
 import json
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import zenoh
 from channel.link import LinkError
 
 _T = TypeVar("_T")
+_REOPEN_S = 0.5  # between two tries
 _CLOSE_S = 2.0  # closing over a network that swallows everything takes Zenoh 10 s
 _QUEUE_BATCHES = 16  # of 64 KiB, the most Zenoh allows
 _PRESENCE = "present"
@@ -47,10 +49,18 @@ class ZenohLink:
     """One site's end of the link; made by `ZenohNode.link`."""
 
     def __init__(self, session: zenoh.Session, own_key: str, peer_key: str, capacity: int) -> None:
-        ring = zenoh.handlers.RingChannel
+        self._keys = (own_key, peer_key)
+        self._capacity = capacity
         self._closed = False
         self._present: set[str] = set()
-        self._subscriber = session.declare_subscriber(peer_key, ring(capacity))
+        self.attach(session)
+
+    def attach(self, session: zenoh.Session) -> None:
+        """Declare all anew on another session; the loop may go on meanwhile."""
+        ring = zenoh.handlers.RingChannel
+        own_key, peer_key = self._keys
+        self._present.clear()
+        self._subscriber = session.declare_subscriber(peer_key, ring(self._capacity))
         self._publisher = session.declare_publisher(
             own_key,
             congestion_control=zenoh.CongestionControl.DROP,
@@ -111,9 +121,15 @@ class Subscription:
     """A ring of what others publish; made by `ZenohNode.subscriber`."""
 
     def __init__(self, session: zenoh.Session, key_expression: str, capacity: int) -> None:
+        self._key_expression = key_expression
+        self._capacity = capacity
         self._closed = False
+        self.attach(session)
+
+    def attach(self, session: zenoh.Session) -> None:
+        """Declare it anew on another session."""
         self._subscriber = session.declare_subscriber(
-            key_expression, zenoh.handlers.RingChannel(capacity)
+            self._key_expression, zenoh.handlers.RingChannel(self._capacity)
         )
 
     def receive(self) -> list[tuple[str, bytes]]:
@@ -129,6 +145,30 @@ class Subscription:
             _bounded(self._subscriber.undeclare)
 
 
+class _Telling:
+    """Publishes bytes for people; made by `ZenohNode.publisher`."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._key = key
+        self._closed = False
+        self.attach(session)
+
+    def attach(self, session: zenoh.Session) -> None:
+        self._publisher = session.declare_publisher(
+            self._key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+        )
+
+    def __call__(self, data: bytes) -> None:
+        if self._closed:
+            return
+        try:
+            self._publisher.put(data)
+        except zenoh.ZError:
+            return  # closed between the two lines
+
+
 class ZenohNode:
     """One process's place in the Zenoh network: one session, and what is declared on it."""
 
@@ -142,8 +182,10 @@ class ZenohNode:
                 "nowhere to meet: give an endpoint to listen on or to connect to, "
                 "such as tcp/192.168.1.2:7447, or a Zenoh configuration file"
             )
+        self._settings = settings
         self._closed = False
-        self._open: list[ZenohLink | Subscription] = []
+        self._reopening = threading.Lock()
+        self._open: list[ZenohLink | Subscription | _Telling] = []
         try:
             self._session = zenoh.open(_config(settings))
         except zenoh.ZError as error:
@@ -165,29 +207,36 @@ class ZenohNode:
         It never blocks and never raises, after `close` too. Keep payloads below 256 KiB: of much
         longer ones the queue cannot hold all fragments, and they never arrive.
         """
-        publisher = self._declare(
-            lambda: self._session.declare_publisher(
-                key,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA_LOW,
-            )
-        )
-
-        def publish(data: bytes) -> None:
-            if self._closed:
-                return
-            try:
-                publisher.put(data)
-            except zenoh.ZError:
-                return  # closed between the two lines
-
-        return publish
+        publisher = self._declare(lambda: _Telling(self._session, key))
+        self._open.append(publisher)
+        return publisher
 
     def subscriber(self, key_expression: str, capacity: int) -> Subscription:
         """Return a subscription to `key_expression` that keeps the newest `capacity` payloads."""
         subscription = self._declare(lambda: Subscription(self._session, key_expression, capacity))
         self._open.append(subscription)
         return subscription
+
+    def reopen(self) -> None:
+        """Leave the network and join it again as another; what is declared stays in use.
+
+        Sending drops and nothing arrives meanwhile; tries until it succeeds or the node is closed.
+        For a connection that carries one way only, as Zenoh may leave one behind when it reconnects
+        after an outage about as long as the lease, and which never heals. Not for the loop.
+        """
+        with self._reopening:
+            if self._closed:
+                return
+            _bounded(self._session.close)
+            while not self._closed:
+                try:
+                    self._session = zenoh.open(_config(self._settings))
+                except zenoh.ZError:  # the endpoint is not free yet
+                    time.sleep(_REOPEN_S)
+                    continue
+                for declared in self._open:
+                    declared.attach(self._session)
+                return
 
     def close(self) -> None:
         """Close the session and all that is on it, within seconds. Idempotent, never raises.
@@ -199,7 +248,8 @@ class ZenohNode:
         self._closed = True
         for declared in self._open:
             declared._closed = True  # the session undeclares them all at once
-        _bounded(self._session.close)
+        with self._reopening:
+            _bounded(self._session.close)
 
     def _declare(self, declare: Callable[[], _T]) -> _T:
         try:

@@ -1,6 +1,7 @@
 """What is Zenoh's alone: nodes, telemetry, errors. The link itself is tests/contracts/test_link."""
 
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -53,6 +54,46 @@ def test_telemetry_reaches_a_subscriber_of_a_whole_branch(
     subscription.close()
     subscription.close()
     assert subscription.receive() == []
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_node_that_opens_anew_is_heard_and_hears_while_its_loop_goes_on(
+    nodes: tuple[ZenohNode, ZenohNode], which: int
+) -> None:
+    node, other = nodes[which], nodes[1 - which]
+    here, there = node.link("session/a", "session/b"), other.link("session/b", "session/a")
+    tell, told = node.publisher("session/rows"), other.subscriber("session/rows", 1000)
+    over, heard, errors = threading.Event(), [], []
+
+    def loop() -> None:
+        while not over.is_set():
+            try:
+                here.send(b"from here")
+                tell(b"row")
+                heard.extend(here.receive())
+                time.sleep(1e-4)
+            except Exception as error:
+                errors.append(error)
+                return
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    for round_ in range(3):
+        node.reopen()
+        there.receive(), told.receive()
+        word = f"round {round_}".encode()
+        until(lambda word=word: there.send(word) and word in heard)
+        until(lambda: b"from here" in there.receive())
+        until(lambda: bool(told.receive()))
+        until(there.peer_present)
+        until(here.peer_present)
+    over.set()
+    thread.join()
+    assert errors == []
+    node.close()
+    node.reopen()
+    assert not here.send(b"over")
+    assert here.receive() == []
 
 
 def test_a_run_that_ends_late_does_not_hide_its_successor(
