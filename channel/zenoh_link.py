@@ -5,6 +5,7 @@ of ours ever competes with the control loop for the interpreter.
 """
 
 import json
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from channel.link import LinkError
 
 _T = TypeVar("_T")
 _REOPEN_S = 0.5  # between two tries
+_KEEP_ALIVES = 20  # a lease; a connection given up is gone after one of these parts
 _CLOSE_S = 2.0  # closing over a network that swallows everything takes Zenoh 10 s
 _QUEUE_BATCHES = 16  # of 64 KiB, the most Zenoh allows
 _PRESENCE = "present"
@@ -30,14 +32,19 @@ class ZenohSettings:
     """Where to meet. Peers do not forward for each other: to hear both sites, connect to both.
 
     Endpoints are Zenoh's, such as "tcp/192.168.1.2:7447". `lease_ms` is how long the other side
-    waits in silence before it takes this one for gone. `config_file` is a Zenoh configuration of
-    the user's own (routers, TLS, access control), taken as it is; only endpoints given here
-    override it.
+    waits in silence before it takes this one for gone; nodes of a higher `tier` are waited for a
+    quarter of it longer each. The tier is 0 for a node that none dials, else one more than that of
+    all that dial it: who is dialled has then given a dead connection up well before it is dialled
+    anew. Where both do so at once, Zenoh may merge the new connection with the dying one, which
+    leaves one direction dead for good (zenoh issue 2806). `config_file` is a Zenoh configuration of
+    the user's own (routers, TLS, access control), taken as it is, lease too; only endpoints given
+    here override it.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_ms: int = 500
+    tier: int = 0
     config_file: str | None = None
 
     def __post_init__(self) -> None:
@@ -187,7 +194,10 @@ class ZenohNode:
         self._reopening = threading.Lock()
         self._open: list[ZenohLink | Subscription | _Telling] = []
         try:
-            self._session = zenoh.open(_config(settings))
+            config = _config(settings)
+            self._dialled_ports = _ports(config.get_json("connect/endpoints"))
+            self._needs_all = config.get_json("mode") != '"client"'
+            self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise LinkError(_advice(settings, error)) from error
 
@@ -217,12 +227,23 @@ class ZenohNode:
         self._open.append(subscription)
         return subscription
 
+    def dialled(self) -> bool:
+        """Whether all that this node dials is connected (a client's one router); False if nothing.
+
+        A connection shows until its lease is over, and so does one that carries nothing.
+        """
+        try:
+            links = self._session.info.links()
+        except zenoh.ZError:  # closed meanwhile
+            return False
+        up = self._dialled_ports & {port for link in links for port in _ports(link.dst)}
+        return bool(up) and (up == self._dialled_ports or not self._needs_all)
+
     def reopen(self) -> None:
         """Leave the network and join it again as another; what is declared stays in use.
 
         Sending drops and nothing arrives meanwhile; tries until it succeeds or the node is closed.
-        For a connection that carries one way only, as Zenoh may leave one behind when it reconnects
-        after an outage about as long as the lease, and which never heals. Not for the loop.
+        For a connection that is dead though Zenoh shows it. Not for the loop.
         """
         with self._reopening:
             if self._closed:
@@ -248,8 +269,10 @@ class ZenohNode:
         self._closed = True
         for declared in self._open:
             declared._closed = True  # the session undeclares them all at once
-        with self._reopening:
-            _bounded(self._session.close)
+        reopened = self._reopening.acquire(timeout=_CLOSE_S)  # a router that is gone holds it up
+        _bounded(self._session.close)
+        if reopened:
+            self._reopening.release()
 
     def _declare(self, declare: Callable[[], _T]) -> _T:
         try:
@@ -290,8 +313,8 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
             "transport/shared_memory/enabled": False,
             "transport/unicast/open_timeout": 2000,
             "transport/unicast/accept_timeout": 2000,
-            "transport/link/tx/lease": settings.lease_ms,
-            "transport/link/tx/keep_alive": 4,
+            "transport/link/tx/lease": settings.lease_ms * (4 + settings.tier) // 4,
+            "transport/link/tx/keep_alive": _KEEP_ALIVES,
             # a full queue drops at once instead of holding the loop for a millisecond; in return it
             # must hold a burst: two batches, the default, lose paced packets and any long payload
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
@@ -301,6 +324,10 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _ports(text: str) -> set[str]:
+    return set(re.findall(r':(\d+)(?:[?#][^"]*)?(?="|$)', text))
 
 
 def _drain(subscriber: "_RingSubscriber") -> list[zenoh.Sample]:
