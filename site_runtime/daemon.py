@@ -20,6 +20,7 @@ from site_runtime.clock import SteadyClock
 from site_runtime.daemon_log import DaemonLog, LogFormat
 from site_runtime.flight_recorder import start_recorder
 from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
@@ -171,6 +172,7 @@ def run_daemon(
                 if options.record
                 else nullcontext() as recorder,
                 _status(site, (recorder, metrics), log, options),
+                LinkKeeper(site.channel, node, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -219,6 +221,7 @@ def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNo
             listen=listen if options.listen is None else options.listen,
             connect=connect if options.connect is None else options.connect,
             lease_ms=round(network.lease_s * 1e3),
+            tier=1 if local else 2,  # dashboards dial both sites, the local site the remote one
             config_file=network.zenoh_config,
         )
     )
