@@ -87,11 +87,14 @@ class RobotTerms:
     origins: FloatArray  # (n + 1, 3)
     axes: FloatArray  # (n, 3)
     axes_dot: FloatArray  # (n, 3)
+    _origins_dot: FloatArray | None = None
 
     @property
     def origins_dot(self) -> FloatArray:
-        """Velocities of the `origins`, (n + 1, 3); worked out when asked for, few ticks need it."""
-        return _origins_dot(self.origins, self.axes, self.q_dot)
+        """Velocities of the `origins`, (n + 1, 3); worked out when first asked for."""
+        if self._origins_dot is None:
+            self._origins_dot = _origins_dot(self.origins, self.axes, self.q_dot)
+        return self._origins_dot
 
 
 class RobotModel:

@@ -1,7 +1,6 @@
 """How far a chain is from a point."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from math import inf, sqrt
 
 import numpy as np
@@ -27,20 +26,29 @@ def distances(points: Sequence[Vector], center: Vector) -> tuple[float, float]:
     The links go through n+1 points; midpoints are the paper's measure.
     """
     cx, cy, cz = center
+    (x, y, z), *ends = points
+    sx, sy, sz = x - cx, y - cy, z - cz
+    s2 = sx * sx + sy * sy + sz * sz
     link2 = midpoint2 = inf
-    for (ax, ay, az), (bx, by, bz) in pairwise(points):
-        lx, ly, lz = bx - ax, by - ay, bz - az
-        sx, sy, sz = ax - cx, ay - cy, az - cz
-        along = closest_parameter(sx, sy, sz, lx, ly, lz)
-        ox, oy, oz = sx + along * lx, sy + along * ly, sz + along * lz
-        distance2 = ox * ox + oy * oy + oz * oz
-        if distance2 < link2:
-            link2 = distance2
-        ox, oy, oz = sx + 0.5 * lx, sy + 0.5 * ly, sz + 0.5 * lz
-        distance2 = ox * ox + oy * oy + oz * oz
-        if distance2 < midpoint2:
-            midpoint2 = distance2
-    return sqrt(link2), sqrt(midpoint2)
+    for x, y, z in ends:
+        ex, ey, ez = x - cx, y - cy, z - cz
+        lx, ly, lz = ex - sx, ey - sy, ez - sz
+        # |s + λl|² = s² + 2λ s·l + λ²l², least where λ = −s·l/l²
+        s_l, l2 = sx * lx + sy * ly + sz * lz, lx * lx + ly * ly + lz * lz
+        middle2 = s2 + s_l + 0.25 * l2
+        if middle2 < midpoint2:
+            midpoint2 = middle2
+        if s_l >= 0.0:
+            nearest2 = s2
+        elif -s_l < l2:
+            nearest2 = s2 - s_l * s_l / l2
+        else:
+            nearest2 = s2 + 2.0 * s_l + l2
+        if nearest2 < link2:
+            link2 = nearest2
+        sx, sy, sz = ex, ey, ez
+        s2 += 2.0 * s_l + l2
+    return sqrt(max(link2, 0.0)), sqrt(max(midpoint2, 0.0))
 
 
 def segment_distance(origins: FloatArray, center: FloatArray) -> float:
