@@ -46,14 +46,17 @@ def gram_adjugate_rate(gram: Matrix, gram_dot: Matrix) -> tuple[float, float, Ma
     return w, w_dot, adjugate, ((aa, ab, ac), (ab, bb, bc), (ac, bc, cc))
 
 
-def split_gram(products: Matrix, z: int) -> tuple[Matrix, Matrix]:
-    """Return B = JJᵀ and Ḃ from the products of the rows J, J̇, … among each other."""
+def split_gram(products: Matrix, z: int, rate_row: int) -> tuple[Matrix, Matrix]:
+    """Return B = JJᵀ and Ḃ, (z, z), from the products of rows among each other.
+
+    The first rows are J, those from `rate_row` on J̇.
+    """
+    gram = [row[:z] for row in products[:z]]
+    half = [row[:z] for row in products[rate_row : rate_row + z]]  # J̇Jᵀ
     if z == 2:
-        (a, b, *_), (_, d, *_), (p, q, *_), (r, s, *_) = products[:4]
-        return ((a, b), (b, d)), ((2.0 * p, q + r), (q + r, 2.0 * s))
-    gram = tuple(tuple(row[:z]) for row in products[:z])
-    half = [row[:z] for row in products[z : 2 * z]]  # J̇Jᵀ
-    return gram, tuple(tuple(half[i][j] + half[j][i] for j in range(z)) for i in range(z))
+        (a, b), (c, d) = half
+        return gram, ((a + a, b + c), (b + c, d + d))
+    return gram, [[half[i][j] + half[j][i] for j in range(z)] for i in range(z)]
 
 
 def times(matrix: Matrix, vector: Sequence[float]) -> Sequence[float]:

@@ -43,7 +43,7 @@ def null_space_velocity(
     rows = np.empty((2 * z + 2, n))
     rows[:z], rows[z:-2], rows[-2], rows[-1] = J, J_dot, g, g_dot
     products = rows.dot(rows.T).tolist()
-    w, w_dot, adjugate, adjugate_dot = gram_adjugate_rate(*split_gram(products, z))
+    w, w_dot, adjugate, adjugate_dot = gram_adjugate_rate(*split_gram(products, z, z))
     along_g, along_g_dot = products[-2], products[-1]
     J_g = along_g[:z]
     rate = [a + b for a, b in zip(along_g[z:-2], along_g_dot[:z], strict=True)]  # J̇g + Jġ

@@ -31,10 +31,12 @@ class WeightedSum:
 
     def evaluate(self, terms: Terms) -> FloatArray:
         """Return g and ġ, (2, n)."""
-        total = self.weights[0] * self.tasks[0].evaluate(terms)
+        total = self.tasks[0].evaluate(terms)
+        total *= self.weights[0]
         for task, weight in zip(self.tasks[1:], self.weights[1:], strict=True):
             part = task.evaluate(terms)
-            part *= weight
+            if weight != 1.0:
+                part *= weight
             total += part
         return total
 

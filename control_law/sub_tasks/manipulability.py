@@ -31,33 +31,19 @@ class ManipulabilityAscent:
         a_k×J_i for k < i.
         """
         z, n = terms.J.shape
-        rows = np.concatenate((terms.J, terms.J_dot))
+        rows = np.concatenate((terms.J_xyz, terms.J_xyz_dot))
         products = rows.dot(rows.T).tolist()
-        _, _, adjugate, adjugate_dot = gram_adjugate_rate(*split_gram(products, z))
-        none = (0.0,) * z
-        mixed = np.array(
-            [
-                *((*row, *none) for row in adjugate),
-                *((*row_dot, *row) for row, row_dot in zip(adjugate, adjugate_dot, strict=True)),
-            ]
-        )
-        columns = mixed.dot(rows).T.tolist()  # of P, then of Ṗ
-        if z == 2:
-            columns = [(px, py, 0.0, rx, ry, 0.0) for px, py, rx, ry in columns]
-        *starts, (ex, ey, ez) = terms.origins.tolist()
-        *starts_dot, (fx, fy, fz) = terms.origins_dot.tolist()
+        _, _, adjugate, adjugate_dot = gram_adjugate_rate(*split_gram(products, z, 3))
+        mixed = np.zeros((6, 6))
+        mixed[:z, :z] = mixed[3 : 3 + z, 3 : 3 + z] = adjugate
+        mixed[3 : 3 + z, :z] = adjugate_dot
+        columns = mixed.dot(rows).T.tolist()  # of P and Ṗ
 
         slope, slope_dot, joints = [], [], []
         tx = ty = tz = ux = uy = uz = 0.0  # T = Σ_{k<i} P_k×a_k, U = Ṫ
-        for (ax, ay, az), (bx, by, bz), (x, y, z), (vx, vy, vz), (px, py, pz, rx, ry, rz) in zip(
-            terms.axes.tolist(), terms.axes_dot.tolist(), starts, starts_dot, columns, strict=True
+        for (ax, ay, az), (bx, by, bz), (jx, jy, jz, kx, ky, kz), (px, py, pz, rx, ry, rz) in zip(
+            terms.axes.tolist(), terms.axes_dot.tolist(), rows.T.tolist(), columns, strict=True
         ):
-            x, y, z, vx, vy, vz = ex - x, ey - y, ez - z, fx - vx, fy - vy, fz - vz
-            # J_i = a×x, and its rate ȧ×x + a×ẋ
-            jx, jy, jz = ay * z - az * y, az * x - ax * z, ax * y - ay * x
-            kx = by * z - bz * y + ay * vz - az * vy
-            ky = bz * x - bx * z + az * vx - ax * vz
-            kz = bx * y - by * x + ax * vy - ay * vx
             slope.append(jx * tx + jy * ty + jz * tz)
             slope_dot.append(kx * tx + ky * ty + kz * tz + jx * ux + jy * uy + jz * uz)
             tx, ty, tz = tx + py * az - pz * ay, ty + pz * ax - px * az, tz + px * ay - py * ax
