@@ -8,6 +8,7 @@ from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
 from farhand.plot import plot
@@ -41,6 +42,7 @@ for command in (
     certify,
     design,
     reproduce,
+    doctor,
     devices,
     device_check,
     commission_quanser,
