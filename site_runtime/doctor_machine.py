@@ -138,9 +138,9 @@ def processor_times(root: Path = ROOT) -> ProcessorTimes:
 def load(before: ProcessorTimes, root: Path = ROOT) -> Finding:
     """How busy the processors were since `before`, and what the host took of them."""
     now = processor_times(root)
-    total = max(now.total - before.total, 1)
-    stolen = (now.stolen - before.stolen) / total
-    busy = 1.0 - (now.idle - before.idle) / total
+    passed = now.total - before.total
+    stolen = (now.stolen - before.stolen) / max(passed, 1)
+    busy = (passed - (now.idle - before.idle)) / max(passed, 1)
     average = _read(root, "proc/loadavg").split()[0]
     changes = []
     if stolen > _STOLEN_SHARE:
