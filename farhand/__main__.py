@@ -9,6 +9,7 @@ from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
 from farhand.plot import plot
@@ -43,6 +44,7 @@ for command in (
     design,
     reproduce,
     bench,
+    doctor,
     devices,
     device_check,
     commission_quanser,

@@ -30,7 +30,7 @@ NO_DELAY: Mapping[str, TomlValue | None] = {
 LONGEST_S = 1800.0
 """After which a daemon ends by itself, should whoever started it be killed."""
 
-_PATIENCE_S = 60.0
+_PATIENCE_S = 30.0
 _STEADY_S = 0.5  # under full force
 _POLL_S = 0.25
 _BATCHES = 4000

@@ -9,13 +9,14 @@ from datetime import UTC, datetime
 from experiments.benchmarks.faster_than_real_time import SIMULATE
 from experiments.benchmarks.figures import Benchmark, BenchmarkError, Effort, Row, Unmeasured
 from experiments.benchmarks.hand_to_hand import HAND_TO_HAND
-from experiments.benchmarks.machine import describe_machine, load_average, processor_times
+from experiments.benchmarks.machine import describe_machine
 from experiments.benchmarks.missed import MISSED
 from experiments.benchmarks.pairs import PAIRS
 from experiments.benchmarks.site_tick import SITE_TICK
 from experiments.benchmarks.steady import STEADY
 from experiments.benchmarks.telemetry import TELEMETRY
 from experiments.benchmarks.wake_up import WAKE_UP
+from site_runtime.doctor_machine import load, processor_times
 
 BENCHMARKS: tuple[Benchmark, ...] = (
     SITE_TICK,
@@ -47,14 +48,13 @@ def run(
 ) -> Page:
     """Run benchmarks one after the other; what cannot be measured is a line that says why."""
     machine = describe_machine()
-    start_s, before, load = time.monotonic(), processor_times(), load_average()
+    start_s, before = time.monotonic(), processor_times()
     machine["measured"] = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     rows: list[Row | Unmeasured] = []
     for benchmark in benchmarks:
         begins(benchmark)
         rows += _rows(benchmark, effort)
-    machine["load"] = f"{load} before, {load_average()} after"
-    machine["stolen by the host"] = f"{processor_times().stolen_since(before):.1%} of the time"
+    machine["load"] = load(before).measured
     return Page(command, machine, tuple(rows), time.monotonic() - start_s)
 
 
