@@ -45,7 +45,7 @@ def _at(rate_hz: int, effort: Effort) -> Row:
         with Sites("bench-missed", changes) as sites:
             sites.until_heard()
             for rows in sites.hear(effort.seconds / turns).values():
-                ours.append(_missed_share(rows))
+                ours.append(missed_share(rows))
                 ticks_us.append(rows["duration_ns"] * 1e-3)
                 engaged.append(rows["state"] == State.ENGAGED)
         empty += [loop.missed_share for loop in empty_loops(rate_hz, effort.seconds / turns, 2)]
@@ -66,7 +66,8 @@ def _at(rate_hz: int, effort: Effort) -> Row:
     )
 
 
-def _missed_share(rows: RowArray) -> float:
+def missed_share(rows: RowArray) -> float:
+    """Return the share of ticks, from the first row to the last, that the site missed."""
     # by the site's own counts: a batch of rows may have been lost on its way here
     missed, ticks = (int(rows[name][-1]) - int(rows[name][0]) for name in ("missed", "sequence"))
     return missed / (missed + ticks)

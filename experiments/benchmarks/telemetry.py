@@ -30,7 +30,7 @@ from site_runtime.supervisor import State
 from telemetry.companion import SharedMemory
 from telemetry.row_ring import Memory
 
-_TURN_TICKS = 50
+TURN_TICKS = 50
 _WARM_UP_TICKS = 2000
 
 
@@ -86,7 +86,7 @@ class Pair:
 
 def measure(effort: Effort) -> Iterator[Row]:
     """Let the three pairs tick in turns."""
-    turns = max(round(effort.seconds * 1e3 / _TURN_TICKS / 3), 1)
+    turns = max(round(effort.seconds * 1e3 / TURN_TICKS / 3), 1)
     session = load_session(DEMO)
     with TemporaryDirectory(prefix="farhand-bench-") as folder, ExitStack() as stack:
         session = replace(session, recorder=replace(session.recorder, directory=folder))
@@ -102,7 +102,7 @@ def measure(effort: Effort) -> Iterator[Row]:
             pair.took_ns.clear()
         for _ in range(turns):
             for pair in pairs:
-                for _ in range(_TURN_TICKS):
+                for _ in range(TURN_TICKS):
                     pacer.wait()
                     pair.tick()
     _check(silent, own, read)
@@ -113,18 +113,18 @@ def measure(effort: Effort) -> Iterator[Row]:
         unit="µs",
         ours=Spread.of(with_all),
         yardstick=Spread.of(without),
-        goals=(Goal("added to p50, %", _added_percent(with_all, without), 10.0, 3.0),),
+        goals=(Goal("added to p50, %", added_percent(with_all, without), 10.0, 3.0),),
         notes=(
             f"what is added is the median of {turns} neighbouring turns; a row into the site's own "
-            f"memory alone adds {_added_percent(into_own, without):.1f} %",
+            f"memory alone adds {added_percent(into_own, without):.1f} %",
         ),
     )
 
 
-def _added_percent(took_us: FloatArray, without_us: FloatArray) -> float:
+def added_percent(took_us: FloatArray, without_us: FloatArray) -> float:
     """Return the median over the turns, neighbour by neighbour, of what the median tick gained."""
     ours, yardstick = (
-        np.median(each.reshape(-1, _TURN_TICKS), axis=1) for each in (took_us, without_us)
+        np.median(each.reshape(-1, TURN_TICKS), axis=1) for each in (took_us, without_us)
     )
     return 100.0 * float(np.median(ours / yardstick) - 1.0)
 

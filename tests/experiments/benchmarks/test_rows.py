@@ -12,17 +12,18 @@ from experiments.benchmarks.cyclic import Policy, Sleeper
 from experiments.benchmarks.empty_loop import Loop, empty_loops
 from experiments.benchmarks.faster_than_real_time import row_of
 from experiments.benchmarks.figures import BRIEF, BenchmarkError, Effort, Row, Verdict
-from experiments.benchmarks.hand_to_hand import HAND_TO_HAND
-from experiments.benchmarks.missed import MISSED
+from experiments.benchmarks.hand_to_hand import HAND_TO_HAND, hand_to_hand_us, latencies
+from experiments.benchmarks.missed import MISSED, missed_share
 from experiments.benchmarks.pairs import through_router
 from experiments.benchmarks.simulation import SimulationFigures
 from experiments.benchmarks.site_tick import SITE_TICK
 from experiments.benchmarks.sites import Sites
 from experiments.benchmarks.steady import STEADY
-from experiments.benchmarks.telemetry import TELEMETRY
+from experiments.benchmarks.telemetry import TELEMETRY, TURN_TICKS, added_percent
 from experiments.benchmarks.usage import family, usage_of
 from experiments.benchmarks.wake_up import WAKE_UP
 from site_runtime.keys import SiteId
+from telemetry.rows import row_dtype
 
 ATTEMPTS = 3  # a machine may be too crowded for sites to stay engaged
 
@@ -125,6 +126,35 @@ def test_a_histogram_becomes_samples_and_what_is_beyond_it_the_worst() -> None:
 
 def test_missed_ticks_are_a_share_of_those_that_were_due() -> None:
     assert Loop(np.zeros(90, dtype=np.int64), 10).missed_share == pytest.approx(0.1)
+
+
+def test_from_hand_to_hand_is_from_one_reading_to_the_other_writing_on_one_clock() -> None:
+    sender, receiver = (np.zeros(2, row_dtype(2, 2)) for _ in range(2))
+    sender["stamp_ns"] = 1_000_000, 2_000_000
+    sender["read_ns"], sender["sent_ns"] = 50_000, 200_000
+    receiver["stamp_ns"] = 2_500_000, 3_500_000
+    receiver["used_stamp_ns"], receiver["used_arrival_ns"] = 2_000_000, 2_500_000
+    receiver["write_ns"] = 300_000
+    receiver["clock_offset_ns"] = 77_000_000  # an estimate, where the truth is known
+    (one,) = latencies(sender, receiver)
+    assert one["network"] == 300_000
+    assert hand_to_hand_us(np.array([one])).tolist() == [750.0]
+    assert receiver["clock_offset_ns"][0] == 77_000_000
+
+
+def test_ticks_missed_are_counted_by_the_site_also_where_rows_were_lost() -> None:
+    rows = np.zeros(3, row_dtype(2, 2))
+    rows["sequence"] = 100, 101, 180  # a batch was lost
+    rows["missed"] = 5, 5, 25
+    assert missed_share(rows) == pytest.approx(0.2)
+
+
+def test_what_telemetry_adds_is_told_neighbour_by_neighbour() -> None:
+    machine = np.repeat([1.0, 10.0, 3.0], TURN_TICKS)  # slower in one turn than in the next
+    assert added_percent(1.2 * machine, machine) == pytest.approx(20.0)
+    disturbed = 1.2 * machine
+    disturbed[: TURN_TICKS // 2 - 1] = 1e6
+    assert added_percent(disturbed, machine) == pytest.approx(20.0)
 
 
 @pytest.mark.processes
