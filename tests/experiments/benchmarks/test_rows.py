@@ -82,6 +82,11 @@ def test_a_simulations_figures_are_a_row() -> None:
     assert beside.verdict is Verdict.MISSED
 
 
+def test_a_loop_by_hand_lost_in_the_noise_of_its_start_proves_nothing() -> None:
+    figures = SimulationFigures("paper", 10.001, (4.0,), (1.0,), (1.0,), (1.1,))
+    assert row_of(figures).goals[1].verdict is Verdict.MISSED
+
+
 @pytest.mark.processes
 def test_a_site_that_ends_is_told_with_its_last_words() -> None:
     running = Sites("bench-test", options=("--no-such-option",))
