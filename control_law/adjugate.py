@@ -51,11 +51,13 @@ def split_gram(products: Matrix, z: int, rate_row: int) -> tuple[Matrix, Matrix]
 
     The first rows are J, those from `rate_row` on J̇.
     """
+    if z == 2:
+        first, second = products[0], products[1]
+        p, q = products[rate_row], products[rate_row + 1]
+        r = p[1] + q[0]
+        return (first[:2], second[:2]), ((p[0] + p[0], r), (r, q[1] + q[1]))
     gram = [row[:z] for row in products[:z]]
     half = [row[:z] for row in products[rate_row : rate_row + z]]  # J̇Jᵀ
-    if z == 2:
-        (a, b), (c, d) = half
-        return gram, ((a + a, b + c), (b + c, d + d))
     return gram, [[half[i][j] + half[j][i] for j in range(z)] for i in range(z)]
 
 

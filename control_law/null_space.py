@@ -1,11 +1,14 @@
 """Self-motion: joint velocities that the end effector does not see."""
 
+from operator import add
+
 import numpy as np
 import numpy.typing as npt
 
 from control_law.adjugate import gram_adjugate, gram_adjugate_rate, split_gram, times
 
 FloatArray = npt.NDArray[np.float64]
+_NONE = (0.0, 0.0, 0.0)
 
 
 def manipulability(J: FloatArray) -> float:
@@ -44,19 +47,18 @@ def null_space_velocity(
     rows[:z], rows[z:-2], rows[-2], rows[-1] = J, J_dot, g, g_dot
     products = rows.dot(rows.T).tolist()
     w, w_dot, adjugate, adjugate_dot = gram_adjugate_rate(*split_gram(products, z, z))
-    along_g, along_g_dot = products[-2], products[-1]
-    J_g = along_g[:z]
-    rate = [a + b for a, b in zip(along_g[z:-2], along_g_dot[:z], strict=True)]  # J̇g + Jġ
+    J_g, J_dot_g = products[-2][:z], products[-2][z:-2]
     y = times(adjugate, J_g)
-    y_dot = [a + b for a, b in zip(times(adjugate_dot, J_g), times(adjugate, rate), strict=True)]
+    # ẏ: the rates of adj(JJᵀ), of J and of g, one after the other
+    y_dot = map(add, times(adjugate_dot, J_g), times(adjugate, [*map(add, J_dot_g, products[-1])]))
     # ζ = (wg − Jᵀy)/(w+ε),  ζ̇ = (ẇg + wġ − J̇ᵀy − Jᵀẏ − ẇζ)/(w+ε)
     scale = 1.0 / (w + regularisation)
     fall = w_dot * scale
-    minus_y = [-scale * value for value in y]
+    minus_y = [-scale * a for a in y]
     shares = (
-        (*minus_y, *(0.0 for _ in y), scale * w, 0.0),
+        (*minus_y, *_NONE[:z], scale * w, 0.0),
         (
-            *(scale * (fall * a - b) for a, b in zip(y, y_dot, strict=True)),
+            *[scale * (fall * a - b) for a, b in zip(y, y_dot, strict=True)],
             *minus_y,
             scale * (w_dot - fall * w),
             scale * w,

@@ -98,7 +98,7 @@ class Site:
         self._supervisor = supervisor
         self._clock = clock
         self._times = times
-        self._obstacles_m = [center_3d(centre) for centre in obstacles_m]
+        self._obstacles_m = tuple(center_3d(centre) for centre in obstacles_m)
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
         self._late_ticks = 0
