@@ -154,7 +154,7 @@ def _tick(session: Session, identity: SiteId, seconds: float, cpu: int | None) -
             try:
                 taken = measure_ticks(sites, clock, session.period_ns, seconds)
             except NotDrivenError as error:
-                return Finding(what, Verdict.NOT_MEASURED, str(error))
+                return Finding(what, Verdict.NOT_MEASURED, str(error), decisive=True)
     return tick_finding(what, taken[identity], session.period_ns)
 
 
@@ -208,7 +208,12 @@ def _print(session: Session, findings: list[Finding], holds: bool) -> None:
         table.add_row(found.what, f"[{colour}]{found.verdict.value}[/{colour}]", told)
     OUT.print(table)
     rate = f"{session.loop.rate_hz} Hz"
-    say(f"this machine holds {rate}" if holds else f"[red]this machine does not hold {rate}[/red]")
+    if holds:
+        say(f"this machine holds {rate}")
+    elif any(found.decisive and found.verdict is Verdict.NOT_GOOD for found in findings):
+        say(f"[red]this machine does not hold {rate}[/red]")
+    else:
+        say(f"[red]whether this machine holds {rate} could not be measured[/red]")
 
 
 def _print_json(session: Session, findings: list[Finding], holds: bool) -> None:

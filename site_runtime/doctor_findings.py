@@ -30,5 +30,6 @@ class Finding:
 
 
 def holds_the_rate(findings: Iterable[Finding]) -> bool:
-    """Whether nothing decisive is not good."""
-    return not any(found.decisive and found.verdict is Verdict.NOT_GOOD for found in findings)
+    """Whether all that is decisive was measured, and is good or will do."""
+    enough = (Verdict.GOOD, Verdict.WILL_DO)
+    return all(found.verdict in enough for found in findings if found.decisive)

@@ -90,6 +90,10 @@ def test_the_exit_code_and_the_table_tell_what_was_found(monkeypatch: pytest.Mon
     assert result.exit_code == 1
     for words in ("[old]", "a newer one", "rate_hz = 50", "does not hold 1000 Hz"):
         assert words in result.output
+    found[1] = Finding("tick", Verdict.NOT_MEASURED, "never engaged", decisive=True)
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 1
+    assert "could not be measured" in result.output
     found.pop()
     result = CliRunner().invoke(app, ["doctor"])
     assert result.exit_code == 0

@@ -232,3 +232,4 @@ def test_only_what_is_decisive_decides() -> None:
     loop = Finding("loop", NOT_GOOD, "told", decisive=True)
     assert holds_the_rate([why, Finding("loop", WILL_DO, "told", decisive=True)])
     assert not holds_the_rate([why, loop])
+    assert not holds_the_rate([Finding("loop", Verdict.NOT_MEASURED, "told", decisive=True)])
