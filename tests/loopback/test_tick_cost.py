@@ -122,11 +122,18 @@ def calls_into_c(call: Callable[[], None]) -> int:
     return called - 1  # setprofile itself
 
 
+on_this_python = pytest.mark.skipif(
+    sys.version_info[:2] != (3, 11), reason="the budgets were counted on CPython 3.11"
+)
+
+
+@on_this_python
 def test_a_tick_takes_no_more_instructions_than_its_budget(pair: Pair) -> None:
     taken = typical(pair, opcodes)
     assert taken <= OPCODES * ROOM, f"{taken} instructions, {OPCODES} are allowed: see above"
 
 
+@on_this_python
 def test_a_tick_calls_into_c_no_more_often_than_its_budget(pair: Pair) -> None:
     called = typical(pair, calls_into_c)
     assert called <= CALLS_INTO_C, f"{called} calls, {CALLS_INTO_C} are allowed: see above"
