@@ -6,8 +6,8 @@ of ours ever competes with the control loop for the interpreter.
 
 import json
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -30,13 +30,14 @@ class ZenohSettings:
     Endpoints are Zenoh's, such as "tcp/192.168.1.2:7447". `lease_ms` is how long the other side
     waits in silence before it takes this one for gone. `config_file` is a Zenoh configuration of
     the user's own (routers, TLS, access control), taken as it is; only endpoints given here
-    override it.
+    override it. `configuration` is set over either, by Zenoh's paths: certificates, access control.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_ms: int = 500
     config_file: str | None = None
+    configuration: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.lease_ms < 1:
@@ -189,6 +190,16 @@ class ZenohNode:
         self._open.append(subscription)
         return subscription
 
+    def partners(self) -> tuple[str, ...]:
+        """Return who is connected: the name in the certificate, or else the address."""
+        if self._closed:
+            return ()
+        names = {
+            str(link.zid): link.auth_identifier or str(link.dst)
+            for link in self._session.info.links()
+        }
+        return tuple(sorted(names.values()))
+
     def close(self) -> None:
         """Close the session and all that is on it, within seconds. Idempotent, never raises.
 
@@ -248,7 +259,7 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
             "transport/link/tx/queue/size/real_time": _QUEUE_BATCHES,
             "transport/link/tx/queue/size/data_low": _QUEUE_BATCHES,
         }
-    for key, value in values.items():
+    for key, value in (values | dict(settings.configuration)).items():
         config.insert_json5(key, json.dumps(value))
     return config
 

@@ -10,6 +10,7 @@ from farhand.design import design
 from farhand.devices import device_check, devices
 from farhand.export import export
 from farhand.info import info
+from farhand.keys import keys
 from farhand.plot import plot
 from farhand.recompute import recompute
 from farhand.record import record
@@ -46,6 +47,7 @@ for command in (
     commission_quanser,
 ):
     app.command()(command)
+app.add_typer(keys)
 
 
 def main() -> None:
