@@ -220,17 +220,25 @@ class ZenohNode:
 
 
 def _config(settings: ZenohSettings) -> zenoh.Config:
-    values: dict[str, Any] = {}
+    config = zenoh.Config()
     if settings.config_file is not None:
         if not Path(settings.config_file).is_file():
             raise LinkError(f"config_file = {settings.config_file!r} does not exist")
         config = zenoh.Config.from_file(settings.config_file)
+    for key, value in _values(settings).items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _values(settings: ZenohSettings) -> dict[str, Any]:
+    """Return what is set over Zenoh's defaults, or over the user's file, by Zenoh's paths."""
+    values: dict[str, Any] = {}
+    if settings.config_file is not None:
         if settings.listen:
             values["listen/endpoints"] = settings.listen
         if settings.connect:
             values["connect/endpoints"] = settings.connect
     else:
-        config = zenoh.Config()
         values = {
             "mode": "peer",
             # also when empty: Zenoh's default listens on every interface
@@ -259,9 +267,19 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
             "transport/link/tx/queue/size/real_time": _QUEUE_BATCHES,
             "transport/link/tx/queue/size/data_low": _QUEUE_BATCHES,
         }
-    for key, value in (values | dict(settings.configuration)).items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    return values | dict(settings.configuration)
+
+
+def stock_configuration(settings: ZenohSettings) -> str:
+    """Return these settings as JSON for a program of Zenoh's own, such as zenohd."""
+    tree: dict[str, Any] = {}
+    for path, value in _values(settings).items():
+        *tables, key = path.split("/")
+        holder = tree
+        for table in tables:
+            holder = holder.setdefault(table, {})
+        holder[key] = value
+    return json.dumps(tree, indent=2)
 
 
 def _drain(subscriber: "_RingSubscriber") -> list[zenoh.Sample]:

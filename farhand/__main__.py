@@ -16,6 +16,7 @@ from farhand.recompute import recompute
 from farhand.record import record
 from farhand.replay import replay
 from farhand.reproduce import reproduce
+from farhand.router import router
 from farhand.simulate import simulate
 from local_site.daemon import local
 from remote_site.daemon import remote
@@ -30,6 +31,7 @@ app = typer.Typer(
 for command in (
     local,
     remote,
+    router,
     dashboard,
     demo,
     simulate,
