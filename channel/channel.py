@@ -209,6 +209,11 @@ class Channel:
         return self._newest is not None and self._newest.echo_epoch == self._epoch
 
     @property
+    def echoed_ns(self) -> int | None:
+        """Stamp of my newest sample that the peer has heard; None if it tells of none."""
+        return self._newest.echo_stamp_ns if self._newest and self.peer_confirmed else None
+
+    @property
     def peer_taken(self) -> bool:
         """Whether the newest valid packet answers another site than this one: one is enough."""
         return self._newest is not None and self._newest.echo_epoch not in (NO_EPOCH, self._epoch)

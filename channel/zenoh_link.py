@@ -5,7 +5,9 @@ of ours ever competes with the control loop for the interpreter.
 """
 
 import json
+import re
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +18,8 @@ import zenoh
 from channel.link import LinkError
 
 _T = TypeVar("_T")
+_REOPEN_S = 0.5  # between two tries
+_KEEP_ALIVES = 20  # a lease; a connection given up is gone after one of these parts
 _CLOSE_S = 2.0  # closing over a network that swallows everything takes Zenoh 10 s
 _QUEUE_BATCHES = 16  # of 64 KiB, the most Zenoh allows
 _PRESENCE = "present"
@@ -28,14 +32,20 @@ class ZenohSettings:
     """Where to meet. Peers do not forward for each other: to hear both sites, connect to both.
 
     Endpoints are Zenoh's, such as "tcp/192.168.1.2:7447". `lease_ms` is how long the other side
-    waits in silence before it takes this one for gone. `config_file` is a Zenoh configuration of
-    the user's own (routers, TLS, access control), taken as it is; only endpoints given here
-    override it. `configuration` is set over either, by Zenoh's paths: certificates, access control.
+    waits in silence before it takes this one for gone; nodes of a higher `tier` are waited for a
+    quarter of it longer each. The tier is 0 for a node that none dials, else one more than that of
+    all that dial it: who is dialled has then given a dead connection up well before it is dialled
+    anew. Where both do so at once, Zenoh may merge the new connection with the dying one, which
+    leaves one direction dead for good (zenoh issue 2806). `config_file` is a Zenoh configuration of
+    the user's own (routers, TLS, access control), taken as it is, lease too; only endpoints given
+    here override it. `configuration` is set over either, by Zenoh's paths: certificates, access
+    control.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_ms: int = 500
+    tier: int = 0
     config_file: str | None = None
     configuration: Mapping[str, Any] = field(default_factory=dict)
 
@@ -48,10 +58,18 @@ class ZenohLink:
     """One site's end of the link; made by `ZenohNode.link`."""
 
     def __init__(self, session: zenoh.Session, own_key: str, peer_key: str, capacity: int) -> None:
-        ring = zenoh.handlers.RingChannel
+        self._keys = (own_key, peer_key)
+        self._capacity = capacity
         self._closed = False
         self._present: set[str] = set()
-        self._subscriber = session.declare_subscriber(peer_key, ring(capacity))
+        self.attach(session)
+
+    def attach(self, session: zenoh.Session) -> None:
+        """Declare all anew on another session; the loop may go on meanwhile."""
+        ring = zenoh.handlers.RingChannel
+        own_key, peer_key = self._keys
+        self._present.clear()
+        self._subscriber = session.declare_subscriber(peer_key, ring(self._capacity))
         self._publisher = session.declare_publisher(
             own_key,
             congestion_control=zenoh.CongestionControl.DROP,
@@ -112,9 +130,15 @@ class Subscription:
     """A ring of what others publish; made by `ZenohNode.subscriber`."""
 
     def __init__(self, session: zenoh.Session, key_expression: str, capacity: int) -> None:
+        self._key_expression = key_expression
+        self._capacity = capacity
         self._closed = False
+        self.attach(session)
+
+    def attach(self, session: zenoh.Session) -> None:
+        """Declare it anew on another session."""
         self._subscriber = session.declare_subscriber(
-            key_expression, zenoh.handlers.RingChannel(capacity)
+            self._key_expression, zenoh.handlers.RingChannel(self._capacity)
         )
 
     def receive(self) -> list[tuple[str, bytes]]:
@@ -130,6 +154,30 @@ class Subscription:
             _bounded(self._subscriber.undeclare)
 
 
+class _Telling:
+    """Publishes bytes for people; made by `ZenohNode.publisher`."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._key = key
+        self._closed = False
+        self.attach(session)
+
+    def attach(self, session: zenoh.Session) -> None:
+        self._publisher = session.declare_publisher(
+            self._key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+        )
+
+    def __call__(self, data: bytes) -> None:
+        if self._closed:
+            return
+        try:
+            self._publisher.put(data)
+        except zenoh.ZError:
+            return  # closed between the two lines
+
+
 class ZenohNode:
     """One process's place in the Zenoh network: one session, and what is declared on it."""
 
@@ -143,10 +191,15 @@ class ZenohNode:
                 "nowhere to meet: give an endpoint to listen on or to connect to, "
                 "such as tcp/192.168.1.2:7447, or a Zenoh configuration file"
             )
+        self._settings = settings
         self._closed = False
-        self._open: list[ZenohLink | Subscription] = []
+        self._reopening = threading.Lock()
+        self._open: list[ZenohLink | Subscription | _Telling] = []
         try:
-            self._session = zenoh.open(_config(settings))
+            config = _config(settings)
+            self._dialled_ports = _ports(config.get_json("connect/endpoints"))
+            self._needs_all = config.get_json("mode") != '"client"'
+            self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise LinkError(_advice(settings, error)) from error
 
@@ -166,23 +219,9 @@ class ZenohNode:
         It never blocks and never raises, after `close` too. Keep payloads below 256 KiB: of much
         longer ones the queue cannot hold all fragments, and they never arrive.
         """
-        publisher = self._declare(
-            lambda: self._session.declare_publisher(
-                key,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.DATA_LOW,
-            )
-        )
-
-        def publish(data: bytes) -> None:
-            if self._closed:
-                return
-            try:
-                publisher.put(data)
-            except zenoh.ZError:
-                return  # closed between the two lines
-
-        return publish
+        publisher = self._declare(lambda: _Telling(self._session, key))
+        self._open.append(publisher)
+        return publisher
 
     def subscriber(self, key_expression: str, capacity: int) -> Subscription:
         """Return a subscription to `key_expression` that keeps the newest `capacity` payloads."""
@@ -200,6 +239,38 @@ class ZenohNode:
         }
         return tuple(sorted(names.values()))
 
+    def dialled(self) -> bool:
+        """Whether all that this node dials is connected (a client's one router); False if nothing.
+
+        A connection shows until its lease is over, and so does one that carries nothing.
+        """
+        try:
+            links = self._session.info.links()
+        except zenoh.ZError:  # closed meanwhile
+            return False
+        up = self._dialled_ports & {port for link in links for port in _ports(link.dst)}
+        return bool(up) and (up == self._dialled_ports or not self._needs_all)
+
+    def reopen(self) -> None:
+        """Leave the network and join it again as another; what is declared stays in use.
+
+        Sending drops and nothing arrives meanwhile; tries until it succeeds or the node is closed.
+        For a connection that is dead though Zenoh shows it. Not for the loop.
+        """
+        with self._reopening:
+            if self._closed:
+                return
+            _bounded(self._session.close)
+            while not self._closed:
+                try:
+                    self._session = zenoh.open(_config(self._settings))
+                except zenoh.ZError:  # the endpoint is not free yet
+                    time.sleep(_REOPEN_S)
+                    continue
+                for declared in self._open:
+                    declared.attach(self._session)
+                return
+
     def close(self) -> None:
         """Close the session and all that is on it, within seconds. Idempotent, never raises.
 
@@ -210,7 +281,10 @@ class ZenohNode:
         self._closed = True
         for declared in self._open:
             declared._closed = True  # the session undeclares them all at once
+        reopened = self._reopening.acquire(timeout=_CLOSE_S)  # a router that is gone holds it up
         _bounded(self._session.close)
+        if reopened:
+            self._reopening.release()
 
     def _declare(self, declare: Callable[[], _T]) -> _T:
         try:
@@ -259,8 +333,8 @@ def _values(settings: ZenohSettings) -> dict[str, Any]:
             "transport/shared_memory/enabled": False,
             "transport/unicast/open_timeout": 2000,
             "transport/unicast/accept_timeout": 2000,
-            "transport/link/tx/lease": settings.lease_ms,
-            "transport/link/tx/keep_alive": 4,
+            "transport/link/tx/lease": settings.lease_ms * (4 + settings.tier) // 4,
+            "transport/link/tx/keep_alive": _KEEP_ALIVES,
             # a full queue drops at once instead of holding the loop for a millisecond; in return it
             # must hold a burst: two batches, the default, lose paced packets and any long payload
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
@@ -280,6 +354,10 @@ def stock_configuration(settings: ZenohSettings) -> str:
             holder = holder.setdefault(table, {})
         holder[key] = value
     return json.dumps(tree, indent=2)
+
+
+def _ports(text: str) -> set[str]:
+    return set(re.findall(r':(\d+)(?:[?#][^"]*)?(?="|$)', text))
 
 
 def _drain(subscriber: "_RingSubscriber") -> list[zenoh.Sample]:

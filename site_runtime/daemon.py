@@ -20,6 +20,7 @@ from site_runtime.clock import SteadyClock
 from site_runtime.daemon_log import DaemonLog, LogFormat
 from site_runtime.flight_recorder import start_recorder
 from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
@@ -175,6 +176,7 @@ def run_daemon(
                 if options.record
                 else nullcontext() as recorder,
                 _status(site, (recorder, metrics), log, options),
+                LinkKeeper(site.channel, node, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:

@@ -120,10 +120,19 @@ def _meet(
         listen=tuple(one.text for one in listens),
         connect=tuple(one.text for one in dials),
         lease_ms=round(network.lease_s * 1e3),
+        tier=_tier(own, network.router is not None),
         config_file=network.zenoh_config,
         configuration=configuration,
     )
     return Meeting(settings, credentials, tuple(warnings))
+
+
+def _tier(own: Identity, routed: bool) -> int:
+    """Return how many there are in a row who dial each other before this one."""
+    if routed:
+        return 1 if own == ROUTER else 0
+    # observers dial both sites, the local site the remote one
+    return {Role.LOCAL: 1, Role.REMOTE: 2}.get(own.role, 0)
 
 
 def _require_certificates(listens: Sequence[Endpoint], dials: Sequence[Endpoint]) -> None:

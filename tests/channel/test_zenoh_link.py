@@ -1,6 +1,7 @@
 """What is Zenoh's alone: nodes, telemetry, errors. The link itself is tests/contracts/test_link."""
 
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from channel.link import LinkError
-from channel.zenoh_link import ZenohNode, ZenohSettings
+from channel.zenoh_link import ZenohNode, ZenohSettings, _config, _ports
 
 
 def until(condition: Callable[[], bool], deadline_s: float = 20.0) -> None:
@@ -53,6 +54,86 @@ def test_telemetry_reaches_a_subscriber_of_a_whole_branch(
     subscription.close()
     subscription.close()
     assert subscription.receive() == []
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_node_that_opens_anew_is_heard_and_hears_while_its_loop_goes_on(
+    nodes: tuple[ZenohNode, ZenohNode], which: int
+) -> None:
+    node, other = nodes[which], nodes[1 - which]
+    here, there = node.link("session/a", "session/b"), other.link("session/b", "session/a")
+    tell, told = node.publisher("session/rows"), other.subscriber("session/rows", 1000)
+    over, heard, errors = threading.Event(), [], []
+
+    def loop() -> None:
+        while not over.is_set():
+            try:
+                here.send(b"from here")
+                tell(b"row")
+                heard.extend(here.receive())
+                time.sleep(1e-4)
+            except Exception as error:
+                errors.append(error)
+                return
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    for round_ in range(3):
+        node.reopen()
+        there.receive(), told.receive()
+        word = f"round {round_}".encode()
+        until(lambda word=word: there.send(word) and word in heard)
+        until(lambda: b"from here" in there.receive())
+        until(lambda: bool(told.receive()))
+        until(there.peer_present)
+        until(here.peer_present)
+    over.set()
+    thread.join()
+    assert errors == []
+    node.close()
+    node.reopen()
+    assert not here.send(b"over")
+    assert here.receive() == []
+
+
+def test_what_a_node_dials_shows_while_it_is_connected(
+    nodes: tuple[ZenohNode, ZenohNode], endpoint: str
+) -> None:
+    listening, connecting = nodes
+    until(connecting.dialled)
+    assert not listening.dialled()  # what it accepts is not its to open
+    beyond = ZenohNode(ZenohSettings(connect=(endpoint, "tcp/127.0.0.1:1")))
+    link, other = beyond.link("session/c", "session/a"), listening.link("session/a", "session/c")
+    until(lambda: link.send(b"connected") and other.receive() != [])
+    assert not beyond.dialled()  # not all of it
+    beyond.close()
+    assert not beyond.dialled()
+    listening.close()
+    until(lambda: not connecting.dialled())
+
+
+@pytest.mark.parametrize(
+    ("text", "ports"),
+    [
+        ('["tcp/192.168.1.2:7447","udp/[::1]:7448?rel=0#iface=a:9"]', {"7447", "7448"}),
+        ('{"router":["tls/host.example:1"],"peer":[]}', {"1"}),
+        ("tcp/[fe80::12:34]:48164", {"48164"}),
+        ('["unixsock-stream/a/b"]', set()),
+    ],
+)
+def test_ports_of_endpoints(text: str, ports: set[str]) -> None:
+    assert _ports(text) == ports
+
+
+def test_who_is_dialled_is_waited_for_longer_than_who_dials() -> None:
+    """Else both ends of a dead connection give it up at once, and the next may be lost in it."""
+    leases = [
+        int(_config(ZenohSettings(listen=("tcp/127.0.0.1:0",), lease_ms=500, tier=tier)).get_json(
+            "transport/link/tx/lease"
+        ))
+        for tier in range(3)
+    ]  # fmt: skip
+    assert leases == [500, 625, 750]
 
 
 def test_a_run_that_ends_late_does_not_hide_its_successor(

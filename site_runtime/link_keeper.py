@@ -1,0 +1,91 @@
+"""Sees to it that a link that is connected and yet dead is opened anew."""
+
+import threading
+from types import TracebackType
+from typing import Final, Protocol, Self
+
+from channel.channel import Channel
+from site_runtime.clock import Clock
+from site_runtime.daemon_log import DaemonLog
+
+UNHEARD_S: Final = 3.0
+"""So long must the peer not answer: longer than any round trip of a usable network."""
+
+LONGEST_S: Final = 60.0
+"""Where opening anew does not help, the time between two tries doubles up to this."""
+
+_LOOK_S = 0.5
+
+
+class Connection(Protocol):
+    """What the keeper needs of the node."""
+
+    def dialled(self) -> bool:
+        """Whether all that it dials is connected."""
+
+    def reopen(self) -> None:
+        """Leave the network and join it anew, however long it takes."""
+
+
+class LinkKeeper:
+    """Watches one site's channel from a thread of its own, in a `with` statement.
+
+    Only the site that dials can mend a connection, and only where one stands: an outage is waited
+    out. A peer that obeys another site, or one with another session, is heard and so no reason.
+    """
+
+    def __init__(
+        self, channel: Channel, connection: Connection, clock: Clock, log: DaemonLog
+    ) -> None:
+        self._channel = channel
+        self._connection = connection
+        self._clock = clock
+        self._log = log
+        self._refused = 0
+        self._patience_s = UNHEARD_S
+        self._well_ns = clock.now_ns()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="link", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._ended.set()
+        self._thread.join(timeout=1.0)
+
+    def look(self) -> None:
+        """Open the link anew if it has been connected for so long, and the peer not answered."""
+        now_ns = self._clock.now_ns()
+        if self._answered(now_ns):
+            self._patience_s = UNHEARD_S
+            self._well_ns = now_ns
+        elif not self._connection.dialled():
+            self._well_ns = now_ns
+        elif now_ns - self._well_ns >= self._patience_s * 1e9:
+            self._log.say("connected, and no answer: the connection is opened anew", "WARN")
+            self._connection.reopen()
+            self._patience_s = min(2.0 * self._patience_s, LONGEST_S)
+            self._well_ns = self._clock.now_ns()
+
+    def _answered(self, now_ns: int) -> bool:
+        channel = self._channel
+        refused, before = channel.counters.rejected.total(), self._refused
+        self._refused = refused
+        if refused != before or (channel.peer_taken and _recent(channel.heard_ns, now_ns)):
+            return True
+        return _recent(channel.echoed_ns, now_ns)
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_LOOK_S):
+            self.look()
+
+
+def _recent(stamp_ns: int | None, now_ns: int) -> bool:
+    return stamp_ns is not None and now_ns - stamp_ns < UNHEARD_S * 1e9
