@@ -45,7 +45,7 @@ def meet_as_site(
     network = session.network
     local = site is SiteId.LOCAL
     if network.router is not None:
-        listens, dials = [], [_wide_area(Endpoint("network.router", network.router))]
+        listens, dials = [], [Endpoint("network.router", network.router)]
     else:
         own = "local_listen" if local else "remote_listen"
         listens = [Endpoint(f"network.{own}", getattr(network, own))]
@@ -66,7 +66,7 @@ def meet_as_observer(
     if connect:
         dials = [Endpoint("--connect", text) for text in connect]
     elif network.router is not None:
-        dials = [_wide_area(Endpoint("network.router", network.router))]
+        dials = [Endpoint("network.router", network.router)]
     else:
         dials = [
             Endpoint(f"network.{key}", getattr(network, key))
@@ -82,7 +82,7 @@ def meet_as_router(session: Session, listen: Sequence[str] | None = None) -> Mee
             "network.router is missing: it tells where the relay is, "
             'such as "quic/relay.example:7447"'
         )
-    listens = [_wide_area(Endpoint("network.router", session.network.router))]
+    listens = [Endpoint("network.router", session.network.router)]
     if listen:
         listens = [Endpoint("--listen", text) for text in listen]
     return _meet(session, ROUTER, listens, [])
@@ -110,6 +110,8 @@ def _meet(
         credentials = load_credentials(keys_folder(session), own)
         _require_certificates(listens, dials)
         configuration |= _mutual_tls(session, credentials)
+    if network.router is not None:
+        listens, dials = [*map(_wide_area, listens)], [*map(_wide_area, dials)]
     warnings = _require_secrecy(network.allow_plaintext, [*listens, *dials])
     if credentials is not None and (left := credentials.left()) < NEAR:
         warnings.append(
