@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -159,3 +160,24 @@ def test_who_listens_in_the_remotes_place_is_not_heard(impostor: str, tmp_path: 
         assert link.receive() == []
         assert mouth.receive() == []
         assert not link.peer_present()
+
+
+def test_a_connection_ends_with_the_certificate_that_opened_it(tmp_path: Path) -> None:
+    authority = make_keys(tmp_path / "keys")
+    authority.issue(Identity("local"), LOOPBACK, life=timedelta(seconds=4))
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    file = write_session(
+        tmp_path / "session.toml",
+        tmp_path / "keys",
+        local_listen=f"tls/127.0.0.1:{free_port()}",
+        remote_listen=endpoint,
+        local_connect=endpoint,
+    )
+    session = load_session(file)
+    with (
+        closing(ZenohNode(meet_as_site(session, REMOTE).settings)) as remote,
+        closing(ZenohNode(meet_as_site(session, LOCAL).settings)),
+    ):
+        until(lambda: remote.partners() == ("local-1",), "a connection")
+        until(lambda: remote.partners() == (), "its end")
+        assert never_connects(remote)
