@@ -69,7 +69,13 @@ def make(
         wanted = [*SITES.values(), ROUTER, *observers]
         hosts = _hosts(loaded, host or [], wanted)
         new = not (folder / AUTHORITY / KEY_FILE).exists()
+        if new and (there := _places(folder)):
+            raise SecurityError(
+                f"{folder} has keys of {', '.join(there)} but not the authority that made them: "
+                f"bring it back as {folder / AUTHORITY}, or name another folder in network.keys"
+            )
         authority = create_authority(folder, loaded.name) if new else open_authority(folder)
+        allowed = authority.allowed
         for identity in wanted:
             if identity in authority.identities:
                 _say(f"{identity.name}: is there already")
@@ -84,6 +90,8 @@ def make(
                 f"{folder / AUTHORITY} can make anybody's certificate. Move it to a medium that is "
                 "kept under lock,\nand bring it back to renew and to revoke."
             )
+        elif authority.allowed != allowed:
+            _say(_SPREAD)
         if loaded.network.security != "mtls":
             _say(
                 f'\nIn [network] of {session}:\n  security = "mtls"\n'
@@ -98,10 +106,12 @@ def renew(session: SessionPath, names: Names, host: Hosts = None) -> None:
         loaded, authority = _open(session)
         identities = _known(authority, names)
         hosts = _hosts(loaded, host or [], identities)
+        allowed = authority.allowed
         for identity in identities:
             _say(f"{identity.name}: {authority.issue(identity, hosts[identity])}")
-        _say(f"Copy {_folders(authority, identities)} to where they are used.")
-        _say(_SPREAD)
+        _say(f"Copy {_folders(authority, identities)} to where they are used, and restart there.")
+        if authority.allowed != allowed:
+            _say(_SPREAD)
 
 
 @keys.command()
@@ -119,11 +129,7 @@ def show(session: SessionPath) -> None:
     """Show the certificates that are in the keys folder, and when they expire."""
     with user_errors():
         folder = keys_folder(load_session(session))
-        places = sorted(
-            place.name
-            for place in (folder.iterdir() if folder.is_dir() else ())
-            if place.is_dir() and place.name != AUTHORITY
-        )
+        places = _places(folder)
         if not places:
             raise SecurityError(f"{folder} holds no keys: `farhand keys {session}` makes them")
         for name in places:
@@ -141,6 +147,12 @@ _SPREAD = (
     "Copy every party's allowed.json to its machine, and restart what runs there: each reads it "
     "when it starts."
 )
+
+
+def _places(folder: Path) -> list[str]:
+    """Name the parties whose folders are here."""
+    found = folder.iterdir() if folder.is_dir() else ()
+    return sorted(place.name for place in found if place.is_dir() and place.name != AUTHORITY)
 
 
 def _open(path: Path) -> tuple[Session, Authority]:
