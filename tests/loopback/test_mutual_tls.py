@@ -1,5 +1,6 @@
 """Nobody uninvited: two daemons with certificates, and all who try without the right one."""
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,6 +20,7 @@ from tests.loopback.secured import (
     LOOPBACK,
     SecuredPair,
     dialling,
+    ended,
     free_port,
     make_keys,
     tls,
@@ -181,3 +183,24 @@ def test_a_connection_ends_with_the_certificate_that_opened_it(tmp_path: Path) -
         until(lambda: remote.partners() == ("local-1",), "a connection")
         until(lambda: remote.partners() == (), "its end")
         assert never_connects(remote)
+
+
+def test_a_daemon_warns_of_a_certificate_near_its_end_and_refuses_a_wrong_one(
+    tmp_path: Path,
+) -> None:
+    keys = tmp_path / "keys"
+    make_keys(keys).issue(Identity("remote"), LOOPBACK, life=timedelta(days=9, hours=1))
+    file = write_session(
+        tmp_path / "session.toml", keys, remote_listen=f"tls/127.0.0.1:{free_port()}"
+    )
+    options = ["--duration", "0.2", "--log", "json"]
+    code, said = ended(file, REMOTE, *options)
+    lines = [json.loads(line) for line in said.splitlines()]
+    assert code == 0
+    assert [line["level"] for line in lines if "expires in 9 days" in line["text"]] == ["WARN"]
+    (keys / "remote" / "private_key.pem").chmod(0o640)
+    code, said = ended(file, REMOTE, *options)
+    (line,) = [json.loads(line) for line in said.splitlines()]
+    assert code == 2
+    assert line["level"] == "ERROR"
+    assert "open to others" in line["text"]
