@@ -12,11 +12,13 @@ from farhand.devices import device_check, devices
 from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
+from farhand.keys import keys
 from farhand.plot import plot
 from farhand.recompute import recompute
 from farhand.record import record
 from farhand.replay import replay
 from farhand.reproduce import reproduce
+from farhand.router import router
 from farhand.simulate import simulate
 from local_site.daemon import local
 from remote_site.daemon import remote
@@ -31,6 +33,7 @@ app = typer.Typer(
 for command in (
     local,
     remote,
+    router,
     dashboard,
     demo,
     simulate,
@@ -50,6 +53,7 @@ for command in (
     commission_quanser,
 ):
     app.command()(command)
+app.add_typer(keys)
 
 
 def main() -> None:

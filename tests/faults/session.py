@@ -35,6 +35,7 @@ def write_session(
     if operator is not None:
         document["local"]["operator"] = operator
     document["network"]["lease_s"] = lease_s
+    document["network"]["allow_plaintext"] = True  # namespaces of our own
     if zenoh_config is not None:
         document["network"]["zenoh_config"] = str(zenoh_config)
     for contact in ("environment", "obstacles", "null_space", "sub_tasks"):
