@@ -10,6 +10,7 @@ from farhand.design import design
 from farhand.devices import device_check, devices
 from farhand.export import export
 from farhand.info import info
+from farhand.link_test import link_test
 from farhand.plot import plot
 from farhand.recompute import recompute
 from farhand.record import record
@@ -39,6 +40,7 @@ for command in (
     plot,
     export,
     certify,
+    link_test,
     design,
     reproduce,
     devices,

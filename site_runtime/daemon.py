@@ -140,7 +140,7 @@ def run_daemon(
         requests = OperatorRequests()
         shares_rows = options.record or options.metrics is not None
         with (
-            closing(_node(session, identity, options)) as node,
+            closing(site_node(session, identity, options.listen, options.connect)) as node,
             closing(SharedMemory()) as memory,
         ):
             surroundings = Surroundings(
@@ -210,16 +210,21 @@ def _status(
     return StatusLine(site, running, events, live=text and not options.quiet)
 
 
-def _node(session: Session, identity: SiteId, options: DaemonOptions) -> ZenohNode:
+def site_node(
+    session: Session,
+    identity: SiteId,
+    listen: tuple[str, ...] | None = None,
+    connect: tuple[str, ...] | None = None,
+) -> ZenohNode:
     """Open the site's place in the network; the remote site listens, the local one connects too."""
     network = session.network
     local = identity is SiteId.LOCAL
-    listen = (network.local_listen if local else network.remote_listen,)
-    connect = (network.local_connect,) if local else ()
+    listens = (network.local_listen if local else network.remote_listen,)
+    dials = (network.local_connect,) if local else ()
     return ZenohNode(
         ZenohSettings(
-            listen=listen if options.listen is None else options.listen,
-            connect=connect if options.connect is None else options.connect,
+            listen=listens if listen is None else listen,
+            connect=dials if connect is None else connect,
             lease_ms=round(network.lease_s * 1e3),
             tier=1 if local else 2,  # dashboards dial both sites, the local site the remote one
             config_file=network.zenoh_config,
