@@ -26,6 +26,7 @@ class Feed:
             ZenohSettings(
                 connect=tuple(connect or (network.local_listen, network.remote_listen)),
                 lease_ms=round(network.lease_s * 1e3),
+                open_timeout_ms=round(network.open_timeout_s * 1e3),
                 config_file=network.zenoh_config,
             )
         )

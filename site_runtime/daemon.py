@@ -226,6 +226,7 @@ def site_node(
             listen=listens if listen is None else listen,
             connect=dials if connect is None else connect,
             lease_ms=round(network.lease_s * 1e3),
+            open_timeout_ms=round(network.open_timeout_s * 1e3),
             tier=1 if local else 2,  # dashboards dial both sites, the local site the remote one
             config_file=network.zenoh_config,
         )
