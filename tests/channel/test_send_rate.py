@@ -118,6 +118,7 @@ class Path:
             "session_start_ns": 0, "slowest_send_period_ns": slowest_ns,
         }  # fmt: skip
         self.sites = [Channel(self.ends[k], site=k, epoch=k + 1, **settings) for k in range(2)]
+        self.clocks_ns = [0, CLOCK_NS]
         self.now_ns = 0
 
     def run(self, seconds: float) -> list[float]:
@@ -127,10 +128,10 @@ class Path:
             self.now_ns += MS
             for k, site in enumerate(self.sites):
                 self.ends[k].now_ns = self.now_ns
-                own_ns = self.now_ns + k * CLOCK_NS
+                own_ns = self.now_ns + self.clocks_ns[k]
                 sample = site.latest(own_ns)
                 if k and sample is not None:
-                    ages_s.append((own_ns - CLOCK_NS - sample.stamp_ns) * 1e-9)
+                    ages_s.append((self.now_ns - (sample.stamp_ns - self.clocks_ns[0])) * 1e-9)
                 site.send(own_ns, 2, ZERO, ZERO, ZERO)
         return ages_s
 
@@ -161,3 +162,21 @@ def test_the_spacing_is_never_beyond_the_slowest() -> None:
     before = path.sites[0].counters.sent
     path.run(3.0)
     assert path.sites[0].counters.sent - before == pytest.approx(600, abs=2)
+
+
+def test_a_peer_that_starts_anew_on_another_clock_slows_nothing() -> None:
+    path = Path(30 * MS, 1e6)
+    path.run(1.0)
+    path.ends[1].inbox.clear()
+    path.sites[1] = Channel(
+        path.ends[1], site=1, epoch=99, session_digest=1, dimension=2, send_period_ns=MS,
+        silence_ns=S, session_start_ns=0,
+    )  # fmt: skip
+    path.clocks_ns[1] += 1000 * S
+    for _ in range(1000):  # long enough to be taken for another run
+        path.now_ns += MS
+        path.sites[0].latest(path.now_ns)
+    path.run(2.0)
+    assert path.sites[0].peer_confirmed
+    assert path.sites[0].counters.peer_restarts == 1
+    assert not path.sites[0].slowed
