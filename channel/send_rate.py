@@ -5,6 +5,9 @@ from typing import Final
 EXCESS_NS: Final = 50_000_000
 """Time on the way above the least of late that is taken for a queue of one's own."""
 
+LASTING_NS: Final = 100_000_000
+"""So long at the least: a stall of either machine, or of a radio, is no queue."""
+
 CALM_NS: Final = 1_000_000_000
 """So long without half of it, and the rate grows by a step."""
 
@@ -16,7 +19,7 @@ FLOOR_NS: Final = 20_000_000_000
 
 
 class SendRate:
-    """Halves when the peer tells of packets late on the way to it; grows back step by step.
+    """Halves when packets keep coming late to the peer; grows back step by step.
 
     What counts is the peer's arrival minus my stamp, of packets that it echoes: the way to the peer
     alone, on two clocks whose difference is in the least of late too. A halving must show in a
@@ -42,6 +45,7 @@ class SendRate:
         """Forget the way: the peer has another clock. The rate stays."""
         self._newest_ns: int | None = None
         self._cut_ns: int | None = None
+        self._late_ns: int | None = None
         self._calm_ns = 0
         self._since_ns = 0
         self._current_ns = 0
@@ -57,10 +61,14 @@ class SendRate:
             self._calm_ns = now_ns
         self._newest_ns = echo_stamp_ns
         if excess_ns > EXCESS_NS:
-            if self._cut_ns is None or echo_stamp_ns >= self._cut_ns:
+            self._late_ns = now_ns if self._late_ns is None else self._late_ns
+            lasting = now_ns - self._late_ns >= LASTING_NS
+            if lasting and (self._cut_ns is None or echo_stamp_ns >= self._cut_ns):
                 self._cut_ns = now_ns
                 self._set(max(self._share / 2, self._least))
-        elif self._share < 1.0 and now_ns - self._calm_ns >= CALM_NS:
+            return
+        self._late_ns = None
+        if self._share < 1.0 and now_ns - self._calm_ns >= CALM_NS:
             self._calm_ns = now_ns
             self._set(min(self._share + STEP, 1.0))
 

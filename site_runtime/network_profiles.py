@@ -36,7 +36,6 @@ PROFILES: Final[Mapping[str, NetworkProfile]] = MappingProxyType(
         ),
     }
 )
-_REPEATING = ("tcp/", "tls/", "ws/")
 
 
 def fill(document: dict[str, Any]) -> None:
@@ -71,10 +70,3 @@ def fitting(round_trip_s: float, jitter_s: float, lost: float) -> ProfileName:
         if within and lost <= profile.lost:
             return name
     return "lossy"
-
-
-def unfit(name: str, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Return those endpoints that repeat what is lost, on a network where that makes it late."""
-    if not PROFILES[name].loss_tolerant:
-        return ()
-    return tuple(endpoint for endpoint in endpoints if endpoint.startswith(_REPEATING))

@@ -28,10 +28,13 @@ def test_it_halves_once_a_way_and_no_further_than_the_slowest() -> None:
     echo(rate, 100 * MS, EXCESS_NS)
     assert rate.period_ns == 4 * MS, "at the bound, not beyond"
     echo(rate, 200 * MS, EXCESS_NS + 1)
+    echo(rate, 299 * MS, EXCESS_NS + 1)
+    assert rate.period_ns == 4 * MS, "a stall of a tenth of a second is no queue"
+    echo(rate, 300 * MS, EXCESS_NS + 1)
     assert rate.period_ns == 8 * MS
-    echo(rate, 210 * MS, 10 * EXCESS_NS)
+    echo(rate, 310 * MS, 10 * EXCESS_NS)
     assert rate.period_ns == 8 * MS, "that was sent before the halving"
-    for now_ms in range(260, 2000, 60):
+    for now_ms in range(360, 2000, 60):
         echo(rate, now_ms * MS, EXCESS_NS + 1)
     assert rate.period_ns == 20 * MS
 
@@ -39,7 +42,8 @@ def test_it_halves_once_a_way_and_no_further_than_the_slowest() -> None:
 def test_it_comes_back_a_step_each_calm_second() -> None:
     rate = SendRate(4 * MS, 32 * MS)
     echo(rate, 0, 0)
-    echo(rate, S, 2 * EXCESS_NS)
+    for now_ms in (800, 900, 950, 990):
+        echo(rate, now_ms * MS, 0 if now_ms == 950 else 2 * EXCESS_NS)
     assert rate.share == 0.5
     for now_ms in range(1010, 17_500, 10):
         # half the excess is no calm
@@ -68,6 +72,7 @@ def test_a_repeated_echo_and_another_clock_say_nothing() -> None:
     rate.heard(10 * MS, -60 * MS, CLOCK_NS + S)
     rate.reset()
     rate.heard(20 * MS, -50 * MS, CLOCK_NS + 100 * S)
+    rate.heard(200 * MS, 150 * MS, CLOCK_NS + 100 * S + 200 * MS)
     assert rate.share == 1.0
 
 
@@ -77,6 +82,7 @@ def test_the_slowest_is_no_faster_than_the_fastest() -> None:
     fixed = SendRate(4 * MS, 4 * MS)
     echo(fixed, 0, 0)
     echo(fixed, S, S)
+    echo(fixed, 2 * S, S)
     assert fixed.period_ns == 4 * MS
 
 
@@ -143,7 +149,7 @@ def test_a_queue_of_one_s_own_is_brought_down_and_the_rate_comes_back() -> None:
         one.ends[0].carried_hz = 250.0  # a quarter of what it sends
     worst_s, settled_s, plain_s = path.run(4.0), path.run(20.0), plain.run(4.0)
     assert plain_s[-1] > 2.5, "the queue grows without end"
-    assert max(worst_s) < 1.0
+    assert max(worst_s) < 1.6
     assert np.median(settled_s) < 0.05
     assert max(settled_s) < 0.03 + 4 * EXCESS_NS * 1e-9
     assert path.sites[0].slowed

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from site_runtime.certification import certified_round_trip_s, certify, slowest_send_period_ns
-from site_runtime.network_profiles import PROFILES, fitting, unfit
+from site_runtime.network_profiles import PROFILES, fitting
 from site_runtime.session import Session, SessionFileError, parse_session
 
 DEMO = Path(__file__).parents[2] / "experiments" / "demo.toml"
@@ -63,12 +63,6 @@ def test_the_first_profile_that_a_network_is_within_fits() -> None:
     assert fitting(0.1, 0.04, 0.02) == "lossy"
     assert fitting(0.5, 0.0, 0.0) == "lossy"
     assert fitting(float("nan"), 0.0, 0.0) == "lossy"
-
-
-def test_endpoints_that_repeat_what_is_lost_are_unfit_where_much_is() -> None:
-    endpoints = ("tcp/a:1", "udp/b:2", "tls/c:3", "quic/d:4")
-    assert unfit("lossy", endpoints) == ("tcp/a:1", "tls/c:3")
-    assert unfit("wan", endpoints) == ()
 
 
 def test_adapting_leaves_most_of_the_certificate_to_the_network() -> None:
