@@ -8,8 +8,8 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -41,7 +41,8 @@ class ZenohSettings:
 
     `config_file` is a Zenoh configuration of
     the user's own (routers, TLS, access control), taken as it is, lease too; only endpoints given
-    here override it.
+    here override it. `configuration` is set over either, by Zenoh's paths: certificates, access
+    control.
     """
 
     listen: tuple[str, ...] = ()
@@ -50,6 +51,7 @@ class ZenohSettings:
     open_timeout_ms: int = 2000
     tier: int = 0
     config_file: str | None = None
+    configuration: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.lease_ms < 1:
@@ -235,6 +237,16 @@ class ZenohNode:
         self._open.append(subscription)
         return subscription
 
+    def partners(self) -> tuple[str, ...]:
+        """Return who is connected: the name in the certificate, or else the address."""
+        if self._closed:
+            return ()
+        names = {
+            str(link.zid): link.auth_identifier or str(link.dst)
+            for link in self._session.info.links()
+        }
+        return tuple(sorted(names.values()))
+
     def dialled(self) -> bool:
         """Whether all that this node dials is connected (a client's one router); False if nothing.
 
@@ -290,17 +302,25 @@ class ZenohNode:
 
 
 def _config(settings: ZenohSettings) -> zenoh.Config:
-    values: dict[str, Any] = {}
+    config = zenoh.Config()
     if settings.config_file is not None:
         if not Path(settings.config_file).is_file():
             raise LinkError(f"config_file = {settings.config_file!r} does not exist")
         config = zenoh.Config.from_file(settings.config_file)
+    for key, value in _values(settings).items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _values(settings: ZenohSettings) -> dict[str, Any]:
+    """Return what is set over Zenoh's defaults, or over the user's file, by Zenoh's paths."""
+    values: dict[str, Any] = {}
+    if settings.config_file is not None:
         if settings.listen:
             values["listen/endpoints"] = settings.listen
         if settings.connect:
             values["connect/endpoints"] = settings.connect
     else:
-        config = zenoh.Config()
         values = {
             "mode": "peer",
             # also when empty: Zenoh's default listens on every interface
@@ -329,9 +349,19 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
             "transport/link/tx/queue/size/real_time": _QUEUE_BATCHES,
             "transport/link/tx/queue/size/data_low": _QUEUE_BATCHES,
         }
-    for key, value in values.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
+    return values | dict(settings.configuration)
+
+
+def stock_configuration(settings: ZenohSettings) -> str:
+    """Return these settings as JSON for a program of Zenoh's own, such as zenohd."""
+    tree: dict[str, Any] = {}
+    for path, value in _values(settings).items():
+        *tables, key = path.split("/")
+        holder = tree
+        for table in tables:
+            holder = holder.setdefault(table, {})
+        holder[key] = value
+    return json.dumps(tree, indent=2)
 
 
 def _ports(text: str) -> set[str]:

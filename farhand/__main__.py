@@ -2,20 +2,24 @@
 
 import typer
 
+from farhand.bench import bench
 from farhand.certify import certify
 from farhand.commission import commission_quanser
 from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
+from farhand.keys import keys
 from farhand.link_test import link_test
 from farhand.plot import plot
 from farhand.recompute import recompute
 from farhand.record import record
 from farhand.replay import replay
 from farhand.reproduce import reproduce
+from farhand.router import router
 from farhand.simulate import simulate
 from local_site.daemon import local
 from remote_site.daemon import remote
@@ -30,6 +34,7 @@ app = typer.Typer(
 for command in (
     local,
     remote,
+    router,
     dashboard,
     demo,
     simulate,
@@ -43,11 +48,14 @@ for command in (
     link_test,
     design,
     reproduce,
+    bench,
+    doctor,
     devices,
     device_check,
     commission_quanser,
 ):
     app.command()(command)
+app.add_typer(keys)
 
 
 def main() -> None:

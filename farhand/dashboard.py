@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from farhand.console import ERR, user_errors
-from farhand.feed import Feed
+from farhand.feed import DASHBOARD, Feed
 from farhand.picture import picture_of
 from site_runtime.daemon import Connect, Duration, SessionPath
 from site_runtime.session import Session, load_session
@@ -19,6 +19,9 @@ POLL_S = 0.01
 
 Save = Annotated[Path | None, typer.Option("--save", help="Also save what is shown, as FILE.rrd.")]
 Port = Annotated[int, typer.Option("--port", help="Loopback port for rerun viewers.")]
+As = Annotated[
+    str, typer.Option("--as", metavar="NAME", help="Whose certificate to show, of `farhand keys`.")
+]
 WebPort = Annotated[int, typer.Option("--web-port", help="Loopback port of the web page.")]
 
 
@@ -29,13 +32,14 @@ def dashboard(
     port: Port = 9876,
     web_port: WebPort = 9090,
     duration: Duration = None,
+    observer: As = DASHBOARD,
 ) -> None:
     """Show a running session live: in a window if there is a display, else as a web page."""
     with user_errors():
         loaded = load_session(session)
         with (
             suppress(KeyboardInterrupt),
-            closing(Feed(loaded, connect)) as feed,
+            closing(Feed(loaded, connect, observer)) as feed,
             shown(loaded, save, port, web_port) as board,
             reported(feed, board),
         ):
@@ -68,7 +72,9 @@ def shown(session: Session, save: Path | None, port: int, web_port: int) -> Iter
 
 @contextmanager
 def reported(feed: Feed, board: Dashboard) -> Iterator[None]:
-    """Say at the end what was not shown."""
+    """Say what to mind of the network, and at the end what was not shown."""
+    for warning in feed.warnings:
+        ERR.print(warning, style="yellow", highlight=False, markup=False, soft_wrap=True)
     try:
         yield
     finally:

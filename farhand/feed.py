@@ -3,12 +3,15 @@
 import time
 from collections.abc import Sequence
 
-from channel.zenoh_link import ZenohNode, ZenohSettings
+from channel.zenoh_link import ZenohNode
 from site_runtime.keys import SiteId, telemetry_key
+from site_runtime.security.identity import Identity
+from site_runtime.security.network import meet_as_observer
 from site_runtime.session import Session
 from telemetry.rows import TelemetryError
 from telemetry.stream import Batch, decode_batch
 
+DASHBOARD = "dashboard"
 _CAPACITY = 4000  # batches: well over half a minute of both sites
 
 
@@ -16,20 +19,20 @@ class Feed:
     """Batches of both sites; those of another session, and broken ones, are counted and dropped.
 
     Peers do not forward for each other, so it connects to both sites: by default where the session
-    file says that they listen.
+    file says that they listen, or to its router. `observer` names whose certificate it shows, if
+    the session wants one. `warnings` are for people.
     """
 
-    def __init__(self, session: Session, connect: Sequence[str] | None = None) -> None:
-        network = session.network
+    def __init__(
+        self,
+        session: Session,
+        connect: Sequence[str] | None = None,
+        observer: str = DASHBOARD,
+    ) -> None:
         self._digest = session.digest
-        self._node = ZenohNode(
-            ZenohSettings(
-                connect=tuple(connect or (network.local_listen, network.remote_listen)),
-                lease_ms=round(network.lease_s * 1e3),
-                open_timeout_ms=round(network.open_timeout_s * 1e3),
-                config_file=network.zenoh_config,
-            )
-        )
+        meeting = meet_as_observer(session, Identity(observer), connect)
+        self.warnings = meeting.warnings
+        self._node = ZenohNode(meeting.settings)
         self._subscriptions = [
             self._node.subscriber(telemetry_key(session.name, site), _CAPACITY) for site in SiteId
         ]

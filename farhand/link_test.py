@@ -15,13 +15,14 @@ from channel.link import LinkError
 from channel.zenoh_link import ZenohNode
 from farhand.console import ERR, OUT, say, user_errors
 from site_runtime.clock import SteadyClock
-from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals, site_node
+from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals
 from site_runtime.keys import SiteId, state_key
 from site_runtime.link_figures import Figures, Passage, Spread, figures, traces
 from site_runtime.link_test import SETTLE_S, LinkTestError, Phase, Probe, rates_of
 from site_runtime.margin import margin_of
 from site_runtime.network_profiles import PROFILES, fitting
 from site_runtime.real_time import apply_real_time
+from site_runtime.security.network import meet_as_site
 from site_runtime.session import Session, load_session
 
 EXIT_NOT_COVERED = 1
@@ -94,13 +95,11 @@ def link_test(
 def _node(
     session: Session, site: SiteId, listen: Sequence[str] | None, connect: Sequence[str] | None
 ) -> ZenohNode:
+    meeting = meet_as_site(session, site, listen, connect)
+    for warning in meeting.warnings:
+        _tell(f"network: {warning}")
     try:
-        return site_node(
-            session,
-            site,
-            None if listen is None else tuple(listen),
-            None if connect is None else tuple(connect),
-        )
+        return ZenohNode(meeting.settings)
     except LinkError as error:
         raise LinkTestError(
             f"{error}. If a site, or another link test, runs on this machine, stop it first"

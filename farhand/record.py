@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from farhand.console import ERR, OUT, user_errors
-from farhand.feed import Feed
+from farhand.dashboard import As
+from farhand.feed import DASHBOARD, Feed
 from site_runtime.clock import SteadyClock
 from site_runtime.daemon import Connect, Duration, SessionPath, StopSignals
 from site_runtime.keys import SiteId
@@ -37,6 +38,7 @@ def record(
     force: Annotated[
         bool, typer.Option("--force", help="Also into a folder that holds recordings.")
     ] = False,
+    observer: As = DASHBOARD,
 ) -> None:
     """Record both sites off the network, from any machine that reaches them, until Ctrl-C."""
     with user_errors():
@@ -45,9 +47,11 @@ def record(
         states = {state.value: state.name for state in State}
         named = {key: path.read_bytes() for key, path in named_files(loaded).items()}
         with (
-            closing(Feed(loaded, connect)) as feed,
+            closing(Feed(loaded, connect, observer)) as feed,
             StopSignals(SteadyClock(), duration) as signals,
         ):
+            for warning in feed.warnings:
+                _say(warning)
             _say(f"recording in {folder}")
             recorder = NetworkRecorder(folder, loaded.name, loaded.text, states, named)
             try:

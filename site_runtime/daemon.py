@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from channel.link import LinkError
-from channel.zenoh_link import ZenohNode, ZenohSettings
+from channel.zenoh_link import ZenohNode
 from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
 from site_runtime.clock import SteadyClock
@@ -24,6 +24,7 @@ from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
+from site_runtime.security.network import meet_as_site
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
 from site_runtime.site_events import Companion, SiteEvents
@@ -136,11 +137,12 @@ def run_daemon(
     log = DaemonLog(identity.label, options.log)
     try:
         session = load_session(session_path)
+        meeting = meet_as_site(session, identity, options.listen, options.connect)
         clock = SteadyClock()
         requests = OperatorRequests()
         shares_rows = options.record or options.metrics is not None
         with (
-            closing(site_node(session, identity, options.listen, options.connect)) as node,
+            closing(ZenohNode(meeting.settings)) as node,
             closing(SharedMemory()) as memory,
         ):
             surroundings = Surroundings(
@@ -157,6 +159,8 @@ def run_daemon(
             log.about(session.name, surroundings.epoch)
             site = build(session, surroundings)
             log.say(_greeting(session, site))
+            for warning in meeting.warnings:
+                log.say(f"network: {warning}", "WARN")
             cpus = session.real_time
             cpu = cpus.local_cpu if identity is SiteId.LOCAL else cpus.remote_cpu
             with (
@@ -208,29 +212,6 @@ def _status(
     wall_offset_ns = time.time_ns() - SteadyClock().now_ns()
     events = SiteEvents(site, running, log, wall_offset_ns) if told else None
     return StatusLine(site, running, events, live=text and not options.quiet)
-
-
-def site_node(
-    session: Session,
-    identity: SiteId,
-    listen: tuple[str, ...] | None = None,
-    connect: tuple[str, ...] | None = None,
-) -> ZenohNode:
-    """Open the site's place in the network; the remote site listens, the local one connects too."""
-    network = session.network
-    local = identity is SiteId.LOCAL
-    listens = (network.local_listen if local else network.remote_listen,)
-    dials = (network.local_connect,) if local else ()
-    return ZenohNode(
-        ZenohSettings(
-            listen=listens if listen is None else listen,
-            connect=dials if connect is None else connect,
-            lease_ms=round(network.lease_s * 1e3),
-            open_timeout_ms=round(network.open_timeout_s * 1e3),
-            tier=1 if local else 2,  # dashboards dial both sites, the local site the remote one
-            config_file=network.zenoh_config,
-        )
-    )
 
 
 class StopSignals:

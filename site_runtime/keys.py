@@ -28,3 +28,8 @@ def state_key(session_name: str, site: SiteId) -> str:
 def telemetry_key(session_name: str, site: SiteId) -> str:
     """Key of a site's batches of rows."""
     return f"farhand/{session_name}/{site.label}/telemetry"
+
+
+def presence_keys(session_name: str, site: SiteId) -> str:
+    """Key expression of the liveliness tokens of a site's runs."""
+    return f"{state_key(session_name, site)}/present/*"

@@ -125,6 +125,7 @@ PATH_KEYS = (
     *(f"{site}.robot.path" for site in ("local", "remote")),
     *(f"channel.{direction}.delay.path" for direction in DIRECTIONS),
     "network.zenoh_config",
+    "network.keys",
     "recorder.directory",
 )
 """The keys that name files, relative to the session file."""

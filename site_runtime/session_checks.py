@@ -11,6 +11,7 @@ from site_runtime.session_settings import (
     JointLimitsTask,
     LinearSingularityTask,
     LocalSettings,
+    NetworkSettings,
     ObstacleTask,
     OperatorSettings,
     PaperObstacleTask,
@@ -26,6 +27,7 @@ def contradictions(file: SessionFile) -> Iterator[Problem]:
     """Yield every contradiction between keys, and every file a key names that cannot be used."""
     dimension = file.task.dimension
     yield from _rates(file)
+    yield from _network(file.network)
     for name in DIRECTIONS:
         try:
             _ = getattr(file.channel, name).bound_s  # reads a recorded trace
@@ -46,6 +48,24 @@ def contradictions(file: SessionFile) -> Iterator[Problem]:
     yield from _surroundings(file.remote, dimension)
     if "remote" in joints:
         yield from _sub_tasks(file.remote, joints["remote"], dimension)
+
+
+def _network(network: NetworkSettings) -> Iterator[Problem]:
+    """Yield what contradicts itself; what endpoints may be is a matter of opening the network."""
+    if network.security == "mtls" and network.keys is None:
+        yield Problem(
+            "network.keys",
+            ABSENT,
+            'is missing: security = "mtls" needs the folder that `farhand keys` makes',
+        )
+    if network.zenoh_config is not None:
+        for key, given in (("security", network.security != "none"), ("router", network.router)):
+            if given:
+                yield Problem(
+                    f"network.{key}",
+                    getattr(network, key),
+                    "does not go with zenoh_config, a configuration of your own",
+                )
 
 
 def _rates(file: SessionFile) -> Iterator[Problem]:

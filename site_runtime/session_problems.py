@@ -343,6 +343,9 @@ def _limits(annotation: object) -> list[str]:
 
 
 def _description(annotation: object) -> str | None:
+    if _is_union(annotation):
+        members = [member for member in get_args(annotation) if member is not types.NoneType]
+        return _description(members[0]) if len(members) == 1 else None
     given = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
     found = [item.description for item in given if isinstance(item, FieldInfo)]
     return next((words for words in found if words), None)

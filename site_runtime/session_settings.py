@@ -113,7 +113,7 @@ class ChannelSettings:
 
 @dataclass(frozen=True, slots=True)
 class NetworkSettings:
-    """Where the sites meet; each machine may have its own."""
+    """Where the sites meet, and by what right; each machine may have its own."""
 
     local_listen: Locator = "tcp/127.0.0.1:7448"
     remote_listen: Locator = "tcp/127.0.0.1:7447"
@@ -122,6 +122,10 @@ class NetworkSettings:
     open_timeout_s: Annotated[float, Field(ge=0.1, le=60)] = 2.0
     lease_s: Annotated[float, Field(ge=0.05, le=60)] = 0.5
     zenoh_config: str | None = None
+    security: Literal["none", "mtls"] = "none"
+    keys: str | None = None
+    router: Locator | None = None
+    allow_plaintext: bool = False
 
 
 @dataclass(frozen=True, slots=True)

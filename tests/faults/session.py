@@ -43,6 +43,7 @@ def write_session(
         document["network"]["lease_s"] = lease_s
     else:
         document["network"]["profile"] = profile
+    document["network"]["allow_plaintext"] = True  # namespaces of our own
     if zenoh_config is not None:
         document["network"]["zenoh_config"] = str(zenoh_config)
     for contact in ("environment", "obstacles", "null_space", "sub_tasks"):

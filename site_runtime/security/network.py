@@ -1,0 +1,230 @@
+"""How each party of a session meets the others: endpoints, certificates, access control."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from channel.zenoh_link import ZenohSettings
+from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.security.access import access_control, grants
+from site_runtime.security.credentials import (
+    AUTHORITY_FILE,
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    NEAR,
+    Credentials,
+    load_credentials,
+)
+from site_runtime.security.endpoints import Endpoint, in_the_clear
+from site_runtime.security.identity import ROUTER, SITES, Identity, Role, SecurityError
+from site_runtime.session import Session
+
+MOST_STATE_BYTES = 512
+MOST_TELEMETRY_BYTES = 256 * 1024
+BURST = 4
+"""A relay lets through this many times the rate that a site has: delayed packets come in bursts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """How to open a place in the network, and what people should be told of it first."""
+
+    settings: ZenohSettings
+    credentials: Credentials | None
+    warnings: tuple[str, ...]
+
+
+def meet_as_site(
+    session: Session,
+    site: SiteId,
+    listen: Sequence[str] | None = None,
+    connect: Sequence[str] | None = None,
+) -> Meeting:
+    """Return how a site meets its peer; None leaves the session file's word on endpoints."""
+    network = session.network
+    local = site is SiteId.LOCAL
+    if network.router is not None:
+        listens, dials = [], [Endpoint("network.router", network.router)]
+    else:
+        own = "local_listen" if local else "remote_listen"
+        listens = [Endpoint(f"network.{own}", getattr(network, own))]
+        dials = [Endpoint("network.local_connect", network.local_connect)] if local else []
+    return _meet(
+        session,
+        SITES[site],
+        listens if listen is None else [Endpoint("--listen", text) for text in listen],
+        dials if connect is None else [Endpoint("--connect", text) for text in connect],
+    )
+
+
+def meet_as_observer(
+    session: Session, observer: Identity, connect: Sequence[str] | None = None
+) -> Meeting:
+    """Return how a dashboard or a recorder hears the sites."""
+    network = session.network
+    if connect:
+        dials = [Endpoint("--connect", text) for text in connect]
+    elif network.router is not None:
+        dials = [Endpoint("network.router", network.router)]
+    else:
+        dials = [
+            Endpoint(f"network.{key}", getattr(network, key))
+            for key in ("local_listen", "remote_listen")
+        ]
+    return _meet(session, observer, [], dials)
+
+
+def meet_as_router(session: Session, listen: Sequence[str] | None = None) -> Meeting:
+    """Return how the relay of a session waits for its sites and observers."""
+    if session.network.router is None:
+        raise SecurityError(
+            "network.router is missing: it tells where the relay is, "
+            'such as "quic/relay.example:7447"'
+        )
+    listens = [Endpoint("network.router", session.network.router)]
+    if listen:
+        listens = [Endpoint("--listen", text) for text in listen]
+    return _meet(session, ROUTER, listens, [])
+
+
+def keys_folder(session: Session) -> Path:
+    """Return the folder of the session's identities: beside the session file unless it says."""
+    if session.network.keys is not None:
+        return Path(session.network.keys)
+    return session.path.resolve().parent / "keys"
+
+
+def _meet(
+    session: Session, own: Identity, listens: list[Endpoint], dials: list[Endpoint]
+) -> Meeting:
+    network = session.network
+    credentials = None
+    configuration: dict[str, Any] = {}
+    if own == ROUTER:
+        configuration |= _relay(session)
+    elif network.router is not None:
+        # peers of regions of their own, not clients: those cannot start before the router does
+        configuration["region_name"] = own.role.value
+    if network.security == "mtls":
+        credentials = load_credentials(keys_folder(session), own)
+        _require_certificates(listens, dials)
+        configuration |= _mutual_tls(session, credentials)
+    if network.router is not None:
+        listens, dials = [*map(_wide_area, listens)], [*map(_wide_area, dials)]
+    warnings = _require_secrecy(network.allow_plaintext, [*listens, *dials])
+    if credentials is not None and (left := credentials.left()) < NEAR:
+        warnings.append(
+            f"the certificate {credentials.common_name} expires in {left.days} days: "
+            f"`farhand keys renew SESSION.toml {own.name}` makes the next"
+        )
+    settings = ZenohSettings(
+        listen=tuple(one.text for one in listens),
+        connect=tuple(one.text for one in dials),
+        lease_ms=round(network.lease_s * 1e3),
+        open_timeout_ms=round(network.open_timeout_s * 1e3),
+        tier=_tier(own, network.router is not None),
+        config_file=network.zenoh_config,
+        configuration=configuration,
+    )
+    return Meeting(settings, credentials, tuple(warnings))
+
+
+def _tier(own: Identity, routed: bool) -> int:
+    """Return how many there are in a row who dial each other before this one."""
+    if routed:
+        return 1 if own == ROUTER else 0
+    # observers dial both sites, the local site the remote one
+    return {Role.LOCAL: 1, Role.REMOTE: 2}.get(own.role, 0)
+
+
+def _require_certificates(listens: Sequence[Endpoint], dials: Sequence[Endpoint]) -> None:
+    """Refuse, of a session with certificates, endpoints that cannot show or check one."""
+    for one in (*listens, *dials):
+        if not one.encrypted:
+            raise SecurityError(
+                f'{one.named_by} = "{one.text}": with security = "mtls" every endpoint is tls/ or '
+                "quic/; whoever came by another would show no certificate and be denied everything"
+            )
+    for one in dials:
+        if one.unspecified:
+            raise SecurityError(
+                f'{one.named_by} = "{one.text}" is no address that a certificate could name: '
+                "give the site's own with --connect"
+            )
+
+
+def _require_secrecy(allow_plaintext: bool, endpoints: Sequence[Endpoint]) -> list[str]:
+    """Refuse, or where allowed return warnings for, plain text that leaves the machine."""
+    warnings = []
+    for one in in_the_clear(endpoints):
+        if not allow_plaintext:
+            raise SecurityError(
+                f'{one.named_by} = "{one.text}" is plain text beyond this machine: anybody on the '
+                'way can read it and move the robot. Use network.security = "mtls" with tls/ or '
+                "quic/ endpoints (docs/deployment.md), or, on a network of your own, "
+                "network.allow_plaintext = true"
+            )
+        warnings.append(
+            f'{one.named_by} = "{one.text}" is plain text (network.allow_plaintext): anybody on '
+            "the way can read it and move the robot"
+        )
+    return warnings
+
+
+def _mutual_tls(session: Session, credentials: Credentials) -> dict[str, Any]:
+    key, certificate = credentials.file(KEY_FILE), credentials.file(CERTIFICATE_FILE)
+    granted = grants(session.name, credentials.identity, session.network.router is not None)
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": credentials.file(AUTHORITY_FILE),
+            "listen_private_key": key,
+            "listen_certificate": certificate,
+            "connect_private_key": key,
+            "connect_certificate": certificate,
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            # else a transport outlives the certificate that opened it
+            "close_link_on_expiration": True,
+        },
+        "access_control": access_control(granted, credentials.names_allowed()),
+    }
+
+
+def _relay(session: Session) -> Mapping[str, Any]:
+    """Return what makes a node the relay of a session, with its limits on size and rate."""
+    states = [state_key(session.name, site) for site in SiteId]
+    rows = [telemetry_key(session.name, site) for site in SiteId]
+    most_hz = BURST * 1e9 / session.send_period_ns
+    sizes = (("state", states, MOST_STATE_BYTES), ("telemetry", rows, MOST_TELEMETRY_BYTES))
+    regions = (Role.LOCAL, Role.REMOTE, Role.OBSERVER)
+    return {
+        "mode": "router",
+        "gateway": {"south": [{"filters": [{"region_names": [role.value]}]} for role in regions]},
+        "low_pass_filter": [
+            {
+                "id": f"{name}-size",
+                "flows": ["ingress"],
+                "messages": ["put"],
+                "key_exprs": keys,
+                "size_limit": size,
+            }
+            for name, keys, size in sizes
+        ],
+        "downsampling": [
+            {
+                # not of telemetry, whose batches come in bursts and must all arrive
+                "id": "state-rate",
+                "flows": ["ingress"],
+                "messages": ["put"],
+                "rules": [{"key_expr": key, "freq": most_hz} for key in states],
+            }
+        ],
+    }
+
+
+def _wide_area(endpoint: Endpoint) -> Endpoint:
+    """Let QUIC carry packets as datagrams, declarations on a stream."""
+    if endpoint.protocol == "quic" and "?" not in endpoint.text:
+        return Endpoint(endpoint.named_by, f"{endpoint.text}?mixed_rel=1")
+    return endpoint

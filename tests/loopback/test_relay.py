@@ -1,0 +1,114 @@
+"""`farhand router`: two daemons that meet at a relay, and those who try through it."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from channel.zenoh_link import ZenohNode, ZenohSettings
+from site_runtime.keys import SiteId, state_key
+from tests.loopback.secured import FORGED, NAME, RATE_HZ, ROOT, SecuredPair, tls, until
+
+pytestmark = pytest.mark.processes
+LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredPair]:
+    pair = SecuredPair(tmp_path_factory.mktemp("relayed"), relay="quic")
+    try:
+        # the relay comes last: nobody waits for it to start
+        pair.start("remote", "local")
+        pair.watch()
+        pair.start("router")
+        pair.until_engaged()
+        yield pair
+    finally:
+        pair.close()
+
+
+def behind(pair: SecuredPair, name: str, region: str) -> ZenohNode:
+    """A node at the relay that enforces nothing itself."""
+    configuration = tls(pair.keys / name) | {"region_name": region}
+    dialled = f"{pair.relay}?mixed_rel=1"
+    return ZenohNode(ZenohSettings(connect=(dialled,), configuration=configuration))
+
+
+def test_the_relay_tells_who_is_connected(pair: SecuredPair) -> None:
+    for name in ("local-1", "remote-1", "observer.dashboard-1"):
+        until(lambda name=name: f"{name} connected" in pair.text("router"), f"{name} told of")
+
+
+def test_a_site_speaks_through_the_relay_in_its_own_name(pair: SecuredPair) -> None:
+    """The control of the next test."""
+    with closing(behind(pair, "remote", "remote")) as node:
+        until(lambda: node.partners() == ("router-1",), "a connection")
+        assert pair.refused_while(node, REMOTE) > 20
+
+
+@pytest.mark.parametrize(
+    ("thief", "speaker"),
+    [("local", REMOTE), ("remote", LOCAL), ("dashboard", LOCAL), ("dashboard", REMOTE)],
+)
+def test_a_certificate_does_not_speak_for_others_through_the_relay(
+    pair: SecuredPair, thief: str, speaker: SiteId
+) -> None:
+    with closing(behind(pair, thief, region=speaker.label)) as node:  # pretending to be there
+        ear = node.subscriber(state_key(NAME, speaker), 100)
+        until(lambda: node.partners() == ("router-1",), "a connection")
+        assert pair.refused_while(node, speaker) == 0
+        if thief == "dashboard":
+            assert {payload for _, payload in ear.receive()} <= {FORGED}  # its own voice
+
+
+def test_what_is_longer_than_any_packet_is_not_relayed(pair: SecuredPair) -> None:
+    before = pair.rejected(LOCAL)
+    with closing(behind(pair, "remote", "remote")) as node:
+        publish = node.publisher(state_key(NAME, REMOTE))
+        until(lambda: node.partners() == ("router-1",), "a connection")
+        for _ in range(50):
+            publish(bytes(513))
+            time.sleep(0.01)
+        assert pair.rejected(LOCAL) == before
+        until(lambda: (publish(bytes(512)), pair.rejected(LOCAL) > before)[1], "shorter ones")
+
+
+def test_a_flood_through_the_relay_is_thinned(pair: SecuredPair) -> None:
+    """To four times the rate that the session has."""
+    before = pair.rejected(LOCAL)
+    with closing(behind(pair, "remote", "remote")) as node:
+        publish = node.publisher(state_key(NAME, REMOTE))
+        until(lambda: node.partners() == ("router-1",), "a connection")
+        until(lambda: (publish(FORGED), pair.rejected(LOCAL) > before)[1], "what is let through")
+        before = pair.rejected(LOCAL)
+        begin_s = time.monotonic()
+        for _ in range(10_000):
+            publish(FORGED)
+        passed = pair.rejected(LOCAL) - before
+        assert passed <= 4 * RATE_HZ * (time.monotonic() - begin_s) + 10
+
+
+def test_a_relay_that_was_killed_is_replaced_and_the_pair_engages_again(pair: SecuredPair) -> None:
+    """First by what a zenohd would be told, given to a session of Zenoh's, then by its own."""
+    printed = subprocess.run(
+        [sys.executable, "-m", "farhand", "router", str(pair.file), "--print-config"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    configuration = json.loads(printed)
+    assert configuration["mode"] == "router"
+    assert configuration["access_control"]["default_permission"] == "deny"
+    file = pair.folder / "zenohd.json5"
+    file.write_text(printed, encoding="utf-8")
+    pair.kill("router")
+    with closing(ZenohNode(ZenohSettings(config_file=str(file)))) as relay:
+        until(lambda: {"local-1", "remote-1"} <= set(relay.partners()), "both at the relay")
+        pair.until_engaged()
+    pair.start("router")
+    pair.until_engaged()
