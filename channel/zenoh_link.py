@@ -36,7 +36,10 @@ class ZenohSettings:
     quarter of it longer each. The tier is 0 for a node that none dials, else one more than that of
     all that dial it: who is dialled has then given a dead connection up well before it is dialled
     anew. Where both do so at once, Zenoh may merge the new connection with the dying one, which
-    leaves one direction dead for good (zenoh issue 2806). `config_file` is a Zenoh configuration of
+    leaves one direction dead for good (zenoh issue 2806). `open_timeout_ms` is how long a handshake
+    may take; over UDP nothing repeats a lost one before it is over.
+
+    `config_file` is a Zenoh configuration of
     the user's own (routers, TLS, access control), taken as it is, lease too; only endpoints given
     here override it. `configuration` is set over either, by Zenoh's paths: certificates, access
     control.
@@ -45,6 +48,7 @@ class ZenohSettings:
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_ms: int = 500
+    open_timeout_ms: int = 2000
     tier: int = 0
     config_file: str | None = None
     configuration: Mapping[str, Any] = field(default_factory=dict)
@@ -52,6 +56,10 @@ class ZenohSettings:
     def __post_init__(self) -> None:
         if self.lease_ms < 1:
             raise ValueError(f"lease_ms = {self.lease_ms} is not allowed: it must be at least 1 ms")
+        if self.open_timeout_ms < 1:
+            raise ValueError(
+                f"open_timeout_ms = {self.open_timeout_ms} is not allowed: it must be at least 1 ms"
+            )
 
 
 class ZenohLink:
@@ -331,8 +339,8 @@ def _values(settings: ZenohSettings) -> dict[str, Any]:
             "open/return_conditions/connect_scouted": False,
             "timestamping/enabled": False,
             "transport/shared_memory/enabled": False,
-            "transport/unicast/open_timeout": 2000,
-            "transport/unicast/accept_timeout": 2000,
+            "transport/unicast/open_timeout": settings.open_timeout_ms,
+            "transport/unicast/accept_timeout": settings.open_timeout_ms,
             "transport/link/tx/lease": settings.lease_ms * (4 + settings.tier) // 4,
             "transport/link/tx/keep_alive": _KEEP_ALIVES,
             # a full queue drops at once instead of holding the loop for a millisecond; in return it

@@ -13,6 +13,7 @@ from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
 from farhand.keys import keys
+from farhand.link_test import link_test
 from farhand.plot import plot
 from farhand.recompute import recompute
 from farhand.record import record
@@ -44,6 +45,7 @@ for command in (
     plot,
     export,
     certify,
+    link_test,
     design,
     reproduce,
     bench,

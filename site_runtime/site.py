@@ -203,7 +203,7 @@ class Site:
         self._supervisor.stop()
         try:
             for packet in range(_FAREWELL_PACKETS):
-                self._say(self._clock.now_ns() + packet * self._times.send_period_ns)
+                self._say(self._clock.now_ns() + packet * self.channel.send_period_ns)
             self.telemetry.drain()
         finally:
             self._device.close()

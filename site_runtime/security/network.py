@@ -122,6 +122,7 @@ def _meet(
         listen=tuple(one.text for one in listens),
         connect=tuple(one.text for one in dials),
         lease_ms=round(network.lease_s * 1e3),
+        open_timeout_ms=round(network.open_timeout_s * 1e3),
         tier=_tier(own, network.router is not None),
         config_file=network.zenoh_config,
         configuration=configuration,
