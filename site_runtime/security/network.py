@@ -63,6 +63,8 @@ def meet_as_site(
     """
     network = session.network
     local = site is SiteId.LOCAL
+    if operator is not None and not local:
+        raise SecurityError(f"--as {operator}: an operator is at the local site, not here")
     if network.router is not None:
         listens, dials = [], [_wide_area(Endpoint("network.router", network.router))]
     else:
