@@ -129,7 +129,8 @@ def look(
         silent_ns = now_ns - lease.heard_ns
         if silent_ns >= rules.expire_ns and not engaged:
             told = f"expired: nothing of {holder} for {silent_ns * 1e-9:.1f} s"
-            return Step(replace(lease, ending=True), (told,))
+            claims = {name: claim for name, claim in fresh.items() if name != holder}
+            return Step(replace(lease, claims=claims, ending=True), (told,))
         return Step(lease)
     if lease.holder is not None and not settled:
         return Step(lease)
