@@ -9,6 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -80,17 +81,16 @@ class ZenohLink:
     def listen_to(self, peer_key: str | None) -> None:
         """Listen to another peer from now on, or to none; not for the loop, which may go on.
 
-        Nothing of the one before arrives once this returns. LinkError if Zenoh refuses.
+        Nothing of the one before arrives once this returns. What cannot be declared, since the node
+        is just opened anew, is declared as soon as it is.
         """
         with self._declaring:
             self._peer_key = peer_key
             before = [self._subscriber, self._presence]
             self._subscriber = self._presence = None
             _bounded(*(one.undeclare for one in before if one is not None))
-            try:
+            with suppress(zenoh.ZError):
                 self._hear()
-            except zenoh.ZError as error:
-                raise LinkError(f"Zenoh refuses to declare a key: {_brief(error)}") from error
 
     def _speak(self) -> None:
         session, own_key = self._session, self._own_key

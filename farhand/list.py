@@ -1,4 +1,4 @@
-"""`farhand list`: the robots that are online, and who holds them. It only listens."""
+"""`farhand list`: the robots that are online, and who holds them; it only listens."""
 
 import json
 import time
@@ -72,7 +72,7 @@ def _where(place: str, connect: list[str] | None, observer: str) -> tuple[ZenohS
         meeting = meet_as_observer(session, Identity(observer), connect)
         return meeting.settings, lease_key(session.name)
     endpoint = Endpoint("ENDPOINT", place)
-    if endpoint.encrypted or not endpoint.address:
+    if endpoint.encrypted:
         raise SecurityError(
             f"{place}: name the session file, which says whose certificate to show; an endpoint "
             "without certificates reads tcp/HOST:PORT"

@@ -197,7 +197,7 @@ def run_daemon(
                 start_recorder(session, site, memory)
                 if options.record
                 else nullcontext() as recorder,
-                _status(site, (recorder, metrics, _companion(lease)), log, options),
+                _status(site, (recorder, metrics), _shown(lease), log, options),
                 lease,
                 LinkKeeper(site.channel, node, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
@@ -255,23 +255,27 @@ def _lease(
     )
 
 
-def _companion(lease: object) -> Companion | None:
-    return lease if isinstance(lease, LeaseClaimant) else None
+def _shown(lease: object) -> tuple[Companion, ...]:
+    return (lease,) if isinstance(lease, LeaseClaimant) else ()
 
 
 def _status(
     site: Site,
     companions: tuple[Companion | None, ...],
+    shown: tuple[Companion, ...],
     log: DaemonLog,
     options: DaemonOptions,
 ) -> StatusLine:
-    """Return what tells people, or programs, how the site is while it runs."""
+    """Return what tells people, or programs, how the site is while it runs.
+
+    What is `shown` is in the status line only: it makes events of its own.
+    """
     text = log.format is LogFormat.TEXT
     running = tuple(companion for companion in companions if companion is not None)
     told = not (text and options.quiet)
     wall_offset_ns = time.time_ns() - SteadyClock().now_ns()
     events = SiteEvents(site, running, log, wall_offset_ns) if told else None
-    return StatusLine(site, running, events, live=text and not options.quiet)
+    return StatusLine(site, (*running, *shown), events, live=text and not options.quiet)
 
 
 class StopSignals:

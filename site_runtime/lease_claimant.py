@@ -8,7 +8,7 @@ from typing import Final, Self
 
 from site_runtime.lease import Verb, Wish
 from site_runtime.lease_keeper import Ear
-from site_runtime.lease_messages import decode_status, encode_wish
+from site_runtime.lease_messages import RemoteStatus, decode_status, encode_wish
 from site_runtime.site import Site
 
 CLAIM_S: Final = 0.25
@@ -19,8 +19,9 @@ _FAREWELLS: Final = 3
 class LeaseClaimant:
     """Claims in one operator's name, from a thread of its own, in a `with` statement.
 
-    A companion of the site: who holds the robot instead is its trouble. The site stays undriven
-    until the remote has said that this operator holds it, and again as soon as it says otherwise.
+    Who holds the robot instead is its trouble, for the status line, and an event. The site stays
+    undriven until the remote has said that this operator holds it, and again as soon as it says
+    otherwise.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class LeaseClaimant:
         self._holds = False
         self._heard_s = time.monotonic()
         self._trouble: str | None = None
+        self._told = ""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._claim, name="lease", daemon=True)
         site.requests.unleased = True
@@ -58,8 +60,6 @@ class LeaseClaimant:
     @property
     def trouble(self) -> str | None:
         """Why this operator does not have the robot, None if he has."""
-        if time.monotonic() - self._heard_s > _SILENT_S:
-            return "the remote site tells nothing of the lease"
         return self._trouble
 
     @property
@@ -71,18 +71,25 @@ class LeaseClaimant:
         """Claim, and take in the newest of what the remote says."""
         self._publish(encode_wish(Wish(Verb.CLAIM, self._epoch)))
         told = [status for _, data in self._ear.receive() if (status := decode_status(data))]
-        if not told:
-            return
-        self._heard_s = time.monotonic()
-        status = told[-1]
-        holds = status.holder == self._person
-        trouble = None if holds else "lease: not held"
-        if (reason := status.refused.get(self._person)) is not None:
-            trouble = f"lease: refused, {reason}"
-        if trouble != self._trouble or holds is not self._holds:
-            self._site.notices.append(trouble or f"lease: {self._person} holds the remote robot")
-        self._trouble, self._holds = trouble, holds
-        self._site.requests.unleased = not holds
+        if told:
+            self._heard_s = time.monotonic()
+            self._holds = told[-1].holder == self._person
+            self._site.requests.unleased = not self._holds
+            self._tell(self._trouble_in(told[-1]))
+        elif time.monotonic() - self._heard_s > _SILENT_S:
+            self._tell("lease: the remote site tells nothing of it")
+
+    def _trouble_in(self, status: RemoteStatus) -> str | None:
+        if self._holds:
+            return None
+        reason = status.refused.get(self._person)
+        return "lease: not held" if reason is None else f"lease: refused, {reason}"
+
+    def _tell(self, trouble: str | None) -> None:
+        text = trouble or f"lease: {self._person} holds the remote robot"
+        if text != self._told:
+            self._site.notices.append(text)
+        self._trouble, self._told = trouble, text
 
     def _claim(self) -> None:
         while not self._ended.wait(CLAIM_S):

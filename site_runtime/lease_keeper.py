@@ -158,8 +158,8 @@ class LeaseKeeper:
             return False
         self._obeyed = obeyed
         if obeyed is None:
-            self._switch.listen_to(None)
             self._site.requests.unleased = True
+            self._switch.listen_to(None)
             self._deaf_ticks = self._site.ticks
         else:
             self._switch.listen_to(state_key(self._session.name, SiteId.LOCAL, obeyed))
