@@ -13,7 +13,7 @@ from site_runtime.daemon import Connect, Operator, SessionPath
 from site_runtime.keys import SiteId, claim_key, lease_key
 from site_runtime.lease import Verb, Wish
 from site_runtime.lease_messages import Answer, RemoteStatus, decode_status, encode_wish
-from site_runtime.security.identity import SecurityError
+from site_runtime.security.identity import Identity, Role, SecurityError
 from site_runtime.security.network import meet_as_site
 from site_runtime.session import load_session
 
@@ -122,6 +122,8 @@ def _ask(
 ) -> None:
     answer: Answer | None = None
     with _asking(path, operator, connect) as asking:
+        if to is not None:
+            Identity(f"{Role.OPERATOR}.{to}")  # no other name could be answered
         wish = Wish(verb, time.time_ns(), to)
         for status in asking.told(wish):
             answer = status.answers.get(asking.person)

@@ -168,6 +168,8 @@ def run_daemon(
                 else state_key(session.name, identity.peer),
             )
             publish = node.publisher(telemetry_key(session.name, identity, meeting.person))
+            if meeting.person is not None:
+                publish = _while_leased(requests, publish)
             surroundings = Surroundings(
                 link=link,
                 clock=clock,
@@ -253,6 +255,18 @@ def _lease(
         node.subscriber(lease_key(name), _WORDS),
         node.publisher(claim_key(name, meeting.person)),
     )
+
+
+def _while_leased(
+    requests: OperatorRequests, publish: Callable[[bytes], None]
+) -> Callable[[bytes], None]:
+    """Let observers see one local site at a time: the one that holds the lease."""
+
+    def tell(data: bytes) -> None:
+        if not requests.unleased:
+            publish(data)
+
+    return tell
 
 
 def _shown(lease: object) -> tuple[Companion, ...]:

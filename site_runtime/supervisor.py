@@ -11,7 +11,8 @@
 | ENGAGED | HOLD | the loop is older than what `derate_to` of the gains is proven for |
 | HOLD | ENGAGED | all of that is over; a peer that engaged anew meanwhile drives, and is aligned |
 | HOLD | READY | after `stop_after`; in its last `release` nothing leads back |
-| ENGAGED, RELEASED | HOLD | the lease is over: that last `release` begins, and then READY |
+| ENGAGED | HOLD | the lease is over: the last `release` of a HOLD begins, as it does of any other |
+| RELEASED | READY | the lease is over, and `release` too |
 | ENGAGED, HOLD | RELEASED | the local operator opens the clutch |
 | RELEASED | ENGAGED, HOLD | the clutch is closed again; HOLD where HOLD would not end |
 | any but FAULT | EMERGENCY_STOP | its operator says so; in all but READY, the peer is in it |
