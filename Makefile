@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: demo test lint format screenshot reproduce fuzz faults soak lock clean
+.PHONY: demo test lint format screenshot reproduce bench fuzz faults soak lock clean
 
 demo: $(READY)  ## both sites on this machine, with the dashboard, until Ctrl-C
 	$(BIN)/farhand demo $(ARGS)
@@ -27,6 +27,9 @@ screenshot: $(READY)  ## the dashboard's picture in the README
 
 reproduce: $(READY)  ## the paper's figures and claims, into docs/reproduction
 	$(BIN)/farhand reproduce all --out docs/reproduction
+
+bench: $(READY)  ## half an hour of figures, each beside its yardstick, into docs/performance.md
+	$(BIN)/farhand bench --page docs/performance.md --json docs/performance.json $(ARGS)
 
 fuzz: $(READY)  ## a million mutated packets, then a coverage-guided minute
 	$(BIN)/python -m tests.fuzz.packets --count 1000000

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 _MISMATCH_SHOWN_NS = 1_000_000_000  # for people: long enough to be read, short enough to clear
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PeerSample:
+class PeerSample(NamedTuple):
     """The peer's sample in use at a tick; vectors (z,) in base axes, read-only.
 
     `stamp_ns` is on the peer's clock, `arrival_ns`, when it came, on mine. `age_ns` is how old the

@@ -1,12 +1,11 @@
 """The offset between two monotonic clocks, from the stamps that packets carry anyway."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 _DRIFT_DIVISOR = 10_000  # 100 ppm: two ordinary quartz clocks, 50 ppm each
 
 
-@dataclass(frozen=True, slots=True)
-class OffsetEstimate:
+class OffsetEstimate(NamedTuple):
     """A time on the peer's clock plus `offset_ns` is the time on mine, ± `uncertainty_ns`."""
 
     offset_ns: int

@@ -2,8 +2,9 @@
 
 import struct
 import zlib
-from dataclasses import dataclass
 from enum import Enum
+from math import isfinite
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +21,9 @@ NO_EPOCH = 0
 """In `echo_epoch`: the sender has heard no peer; the other echo fields then mean nothing."""
 
 _DIMENSIONS = (2, 3)
+_DOUBLE = np.dtype("<f8")
 _HEADER = struct.Struct("<4sBBBBQQQqQqqqq")
 _CHECKSUM = struct.Struct("<I")
-_PREFIX = struct.Struct("<4sB")
 _SIZES = {z: _HEADER.size + 3 * 8 * z + _CHECKSUM.size for z in _DIMENSIONS}
 
 
@@ -51,8 +52,7 @@ class PacketError(Exception):
         self.reason = reason
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Packet:
+class Packet(NamedTuple):
     """One packet; vectors (z,) in base axes, z = 2 or 3, read-only.
 
     Stamps are nanoseconds: `stamp_ns` and `echo_arrival_ns` on the sender's monotonic clock,
@@ -122,17 +122,9 @@ def decode(data: bytes) -> Packet:
     size = len(data)
     if size < _HEADER.size:
         raise PacketError(Reject.LENGTH, f"{size} bytes, the header alone has {_HEADER.size}")
-    # the prefix stays the same in every version, nothing behind it has to
-    magic, version = _PREFIX.unpack_from(data)
-    if magic != MAGIC:
-        raise PacketError(Reject.MAGIC, f"starts with {magic!r}, not with {MAGIC!r}")
-    if version != VERSION:
-        raise PacketError(
-            Reject.VERSION, f"layout {version}, this program speaks {VERSION}: update the older"
-        )
     (
-        _,
-        _,
+        magic,
+        version,
         site,
         state,
         dimension,
@@ -146,6 +138,13 @@ def decode(data: bytes) -> Packet:
         used_stamp_ns,
         greatest_age_ns,
     ) = _HEADER.unpack_from(data)
+    # these two stay the same in every version, nothing behind them has to
+    if magic != MAGIC:
+        raise PacketError(Reject.MAGIC, f"starts with {magic!r}, not with {MAGIC!r}")
+    if version != VERSION:
+        raise PacketError(
+            Reject.VERSION, f"layout {version}, this program speaks {VERSION}: update the older"
+        )
     expected = _SIZES.get(dimension)
     if expected is None:
         raise PacketError(Reject.DIMENSION, f"task dimension {dimension}, must be 2 or 3")
@@ -157,8 +156,9 @@ def decode(data: bytes) -> Packet:
     (checksum,) = _CHECKSUM.unpack_from(data, body_size)
     if zlib.crc32(memoryview(data)[:body_size]) != checksum:
         raise PacketError(Reject.CHECKSUM, f"CRC-32 is not the {checksum:#010x} it carries")
-    vectors = np.frombuffer(data, dtype="<f8", count=3 * dimension, offset=_HEADER.size)
-    if not np.isfinite(vectors).all():
+    vectors = np.frombuffer(data, _DOUBLE, 3 * dimension, _HEADER.size)
+    # a sum may overflow for great numbers too: then look closely
+    if not isfinite(sum(vectors.tolist())) and not np.isfinite(vectors).all():
         raise PacketError(Reject.NON_FINITE, f"position, velocity, force = {vectors.tolist()}")
     return Packet(
         site,

@@ -14,11 +14,14 @@ def reference_error(q_dot: FloatArray, zeta: FloatArray) -> FloatArray:
     return q_dot - zeta
 
 
-def theta(
+def minus_theta(
     M: FloatArray, C: FloatArray, G: FloatArray, zeta: FloatArray, zeta_dot: FloatArray
 ) -> FloatArray:
-    """Return Θ = −Mζ̇ − Cζ − G of (5) [N·m], (n,)."""
-    return -(M @ zeta_dot) - C @ zeta - G
+    """Return −Θ = Mζ̇ + Cζ + G of (5) [N·m], (n,)."""
+    torque: FloatArray = M.dot(zeta_dot)
+    torque += C.dot(zeta)
+    torque += G
+    return torque
 
 
 def control_torque(
@@ -33,7 +36,7 @@ def control_torque(
     `coupling_force` is ΩP(e) [N], (z,), as scaled by the caller. The local site has ζ = ζ̇ = 0.
     """
     s = reference_error(terms.q_dot, zeta)
-    torque = -theta(terms.M, terms.C, terms.G, zeta, zeta_dot)
-    torque -= coupling_force @ terms.J
+    torque = minus_theta(terms.M, terms.C, terms.G, zeta, zeta_dot)
+    torque -= coupling_force.dot(terms.J)
     torque -= damping.apply(terms.J, s)
     return torque, s

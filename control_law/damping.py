@@ -36,7 +36,7 @@ class Damping:
         """Return Λ(q) s [N·m], (n,), without forming Λ."""
         torque = self.joint * s
         if self._task_acts:
-            torque += (self.task * (J @ s)) @ J
+            torque += (self.task * J.dot(s)).dot(J)
         return torque
 
     def matrix(self, J: FloatArray) -> FloatArray:

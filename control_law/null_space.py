@@ -1,16 +1,19 @@
 """Self-motion: joint velocities that the end effector does not see."""
 
+from operator import add
+
 import numpy as np
 import numpy.typing as npt
 
-from control_law.adjugate import gram_adjugate, gram_adjugate_rate
+from control_law.adjugate import gram_adjugate, gram_adjugate_rate, split_gram, times
 
 FloatArray = npt.NDArray[np.float64]
+_NONE = (0.0, 0.0, 0.0)
 
 
 def manipulability(J: FloatArray) -> float:
     """Return w = det(JJᵀ), the paper's manipulability index (Section VI)."""
-    w, _ = gram_adjugate(J)
+    w, _ = gram_adjugate(J.dot(J.T).tolist())
     return w
 
 
@@ -20,9 +23,11 @@ def project(J: FloatArray, v: FloatArray, regularisation: float = 0.0) -> FloatA
     It lies in the null space of J at every pose. ε = 0 is the paper's projector, which has no
     value where w = 0 (ZeroDivisionError).
     """
-    w, adjugate = gram_adjugate(J)
+    w, adjugate = gram_adjugate(J.dot(J.T).tolist())
     scale = 1.0 / (w + regularisation)
-    return (w * v - (adjugate @ (J @ v)) @ J) * scale
+    y = times(adjugate, J.dot(v).tolist())
+    result: FloatArray = (w * v - np.array(y).dot(J)) * scale
+    return result
 
 
 def null_space_velocity(
@@ -35,11 +40,29 @@ def null_space_velocity(
     pseudo-inverse would leave Jζ ≠ 0. ε ≥ 0 in the unit of w, about 1e-3 of its largest value;
     ε = 0 is exactly (4) and raises ZeroDivisionError where w = 0.
     """
-    w, w_dot, adjugate, adjugate_dot = gram_adjugate_rate(J, J_dot)
-    task = J @ g
-    y = adjugate @ task
-    y_dot = adjugate_dot @ task + adjugate @ (J_dot @ g + J @ g_dot)
+    z, n = J.shape
+    # One product gives all that J, J̇, g and ġ have in common, another puts them together again:
+    # two calls instead of some twenty.
+    rows = np.empty((2 * z + 2, n))
+    rows[:z], rows[z:-2], rows[-2], rows[-1] = J, J_dot, g, g_dot
+    products = rows.dot(rows.T).tolist()
+    w, w_dot, adjugate, adjugate_dot = gram_adjugate_rate(*split_gram(products, z, z))
+    J_g, J_dot_g = products[-2][:z], products[-2][z:-2]
+    y = times(adjugate, J_g)
+    # ẏ: the rates of adj(JJᵀ), of J and of g, one after the other
+    y_dot = map(add, times(adjugate_dot, J_g), times(adjugate, [*map(add, J_dot_g, products[-1])]))
+    # ζ = (wg − Jᵀy)/(w+ε),  ζ̇ = (ẇg + wġ − J̇ᵀy − Jᵀẏ − ẇζ)/(w+ε)
     scale = 1.0 / (w + regularisation)
-    zeta = (w * g - y @ J) * scale
-    zeta_dot = (w_dot * g + w * g_dot - y @ J_dot - y_dot @ J - w_dot * zeta) * scale
+    fall = w_dot * scale
+    minus_y = [-scale * a for a in y]
+    shares = (
+        (*minus_y, *_NONE[:z], scale * w, 0.0),
+        (
+            *[scale * (fall * a - b) for a, b in zip(y, y_dot, strict=True)],
+            *minus_y,
+            scale * (w_dot - fall * w),
+            scale * w,
+        ),
+    )
+    zeta, zeta_dot = np.array(shares).dot(rows)
     return zeta, zeta_dot

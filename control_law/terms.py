@@ -39,6 +39,14 @@ class Terms(Protocol):
         """Time derivative of the Jacobian, (z, n)."""
 
     @property
+    def J_xyz(self) -> FloatArray:
+        """J and, below it, the axes that the task ignores, (3, n)."""
+
+    @property
+    def J_xyz_dot(self) -> FloatArray:
+        """Time derivative of J_xyz, (3, n)."""
+
+    @property
     def M(self) -> FloatArray:
         """Inertia matrix, (n, n)."""
 

@@ -15,7 +15,7 @@ from site_runtime.session import Session, SessionError
 from site_runtime.site import Site
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray
-from telemetry.stream import decode_batch
+from telemetry.stream import TelemetryStream
 
 _SETTLE_NS = 100_000_000
 _LOOK_TICKS = 100
@@ -43,7 +43,6 @@ class Simulation:
         self.period_ns = session.period_ns
         self._start_ns = _warm_up_ns(session)
         self.clock = ManualClock()
-        self._batches: tuple[list[bytes], list[bytes]] = ([], [])
         local_link, remote_link = memory_links()
         self.local = build_local_site(
             session,
@@ -52,7 +51,7 @@ class Simulation:
                 self.clock,
                 self._start_ns,
                 _LOCAL_EPOCH,
-                self._batches[0].append,
+                _unpublished,
                 shared_clock=True,
             ),
         )
@@ -63,7 +62,7 @@ class Simulation:
                 self.clock,
                 self._start_ns,
                 _REMOTE_EPOCH,
-                self._batches[1].append,
+                _unpublished,
                 shared_clock=True,
             ),
         )
@@ -79,6 +78,7 @@ class Simulation:
         Every 100 ticks `progress` gets the session time [s], and `until` the newest second's rows.
         """
         sites = (self.local, self.remote)
+        kept = tuple(_KeptRows(site.telemetry) for site in sites)
         for site in sites:
             site.open()
         ticks = round(self._start_ns / self.period_ns + duration_s * 1e9 / self.period_ns)
@@ -86,18 +86,19 @@ class Simulation:
             self.clock.sleep_until_ns(tick * self.period_ns)
             for site in sites:
                 site.tick()
-                site.telemetry.flush()
             if any(site.failure for site in sites):
                 break
             if tick % _LOOK_TICKS:
                 continue
+            for rows in kept:
+                rows.take()
             if progress is not None:
                 progress(max(0.0, (self.clock.now_ns() - self._start_ns) * 1e-9))
             if until is not None and until(self._newest_second()):
                 break
         for site in sites:
             site.close()
-        local, remote = (_rows(batches) for batches in self._batches)
+        local, remote = (rows.since_session_start() for rows in kept)
         # the row of the tick that failed has a reading, but nothing that came of it
         shared = min(np.count_nonzero(rows["state"] != State.FAULT) for rows in (local, remote))
         return Run(local[:shared], remote[:shared], tuple(map(_failure, filter(_failed, sites))))
@@ -108,6 +109,31 @@ class Simulation:
         count = min(since_ns, 1_000_000_000) // self.period_ns
         local, remote = (site.telemetry.last(count) for site in (self.local, self.remote))
         return Run(local, remote, ())
+
+
+class _KeptRows:
+    """All rows of one site, taken out of its ring before they are overwritten."""
+
+    def __init__(self, telemetry: TelemetryStream) -> None:
+        self._telemetry = telemetry
+        self._pieces: list[RowArray] = []
+        self._taken = 0
+
+    def take(self) -> None:
+        """Take those that are new."""
+        count = self._telemetry.count
+        self._pieces.append(self._telemetry.last(count - self._taken))
+        self._taken = count
+
+    def since_session_start(self) -> RowArray:
+        """Return those from session time zero on."""
+        self.take()
+        rows = np.concatenate(self._pieces)
+        return rows[rows["time_ns"] >= 0]
+
+
+def _unpublished(batch: bytes) -> None:
+    """Nobody listens: rows are taken where they are."""
 
 
 def _refuse_real_devices(session: Session) -> None:
@@ -134,11 +160,6 @@ def _warm_up_ns(session: Session) -> int:
         fill_s = settings.local_to_remote.bound_s + settings.remote_to_local.bound_s
     warm_up_ns = round(fill_s * 1e9) + _SETTLE_NS + 10 * session.send_period_ns
     return -(-warm_up_ns // session.period_ns) * session.period_ns
-
-
-def _rows(batches: list[bytes]) -> RowArray:
-    rows = np.concatenate([decode_batch(batch).rows for batch in batches])
-    return rows[rows["time_ns"] >= 0]
 
 
 def _failed(site: Site) -> bool:

@@ -2,12 +2,14 @@
 
 import typer
 
+from farhand.bench import bench
 from farhand.certify import certify
 from farhand.commission import commission_quanser
 from farhand.dashboard import dashboard
 from farhand.demo import demo
 from farhand.design import design
 from farhand.devices import device_check, devices
+from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
 from farhand.keys import keys
@@ -46,6 +48,8 @@ for command in (
     certify,
     design,
     reproduce,
+    bench,
+    doctor,
     devices,
     device_check,
     commission_quanser,

@@ -94,6 +94,11 @@ def make(
         people = [Identity(f"{Role.OPERATOR}.{name}") for name in operator or []]
         people += [Identity(f"{Role.SUPERVISOR}.{name}") for name in supervisor or []]
         new = not (folder / AUTHORITY / KEY_FILE).exists()
+        if new and (there := _places(folder)):
+            raise SecurityError(
+                f"{folder} has keys of {', '.join(there)} but not the authority that made them: "
+                f"bring it back as {folder / AUTHORITY}, or name another folder in network.keys"
+            )
         known = () if new else open_authority(folder).identities
         _require_one_each([*people, *known])
         named = people or any(one.role in PEOPLE for one in known)
@@ -101,6 +106,7 @@ def make(
         wanted = [*at_local, SITES[SiteId.REMOTE], ROUTER, *observers]
         hosts = _hosts(loaded, host or [], wanted)
         authority = create_authority(folder, loaded.name) if new else open_authority(folder)
+        allowed = authority.allowed
         for identity in wanted:
             if identity in authority.identities:
                 _say(f"{identity.name}: is there already")
@@ -115,6 +121,8 @@ def make(
                 f"{folder / AUTHORITY} can make anybody's certificate. Move it to a medium that is "
                 "kept under lock,\nand bring it back to renew and to revoke."
             )
+        elif authority.allowed != allowed:
+            _say(_SPREAD)
         if loaded.network.security != "mtls":
             _say(
                 f'\nIn [network] of {session}:\n  security = "mtls"\n'
@@ -129,10 +137,12 @@ def renew(session: SessionPath, names: Names, host: Hosts = None) -> None:
         loaded, authority = _open(session)
         identities = _known(authority, names)
         hosts = _hosts(loaded, host or [], identities)
+        allowed = authority.allowed
         for identity in identities:
             _say(f"{identity.name}: {authority.issue(identity, hosts[identity])}")
-        _say(f"Copy {_folders(authority, identities)} to where they are used.")
-        _say(_SPREAD)
+        _say(f"Copy {_folders(authority, identities)} to where they are used, and restart there.")
+        if authority.allowed != allowed:
+            _say(_SPREAD)
 
 
 @keys.command()
@@ -150,11 +160,7 @@ def show(session: SessionPath) -> None:
     """Show the certificates that are in the keys folder, and when they expire."""
     with user_errors():
         folder = keys_folder(load_session(session))
-        places = sorted(
-            place.name
-            for place in (folder.iterdir() if folder.is_dir() else ())
-            if place.is_dir() and place.name != AUTHORITY
-        )
+        places = _places(folder)
         if not places:
             raise SecurityError(f"{folder} holds no keys: `farhand keys {session}` makes them")
         for name in places:
@@ -172,6 +178,12 @@ _SPREAD = (
     "Copy every party's allowed.json to its machine, and restart what runs there: each reads it "
     "when it starts."
 )
+
+
+def _places(folder: Path) -> list[str]:
+    """Name the parties whose folders are here."""
+    found = folder.iterdir() if folder.is_dir() else ()
+    return sorted(place.name for place in found if place.is_dir() and place.name != AUTHORITY)
 
 
 def _open(path: Path) -> tuple[Session, Authority]:

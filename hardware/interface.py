@@ -10,7 +10,7 @@ Errors::
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -39,8 +39,7 @@ def nearest_names(name: str, valid: Iterable[str]) -> str:
     return ", ".join(difflib.get_close_matches(name, names, n=5, cutoff=0.5) or names)
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceState:
+class DeviceState(NamedTuple):
     """One reading of a device.
 
     `wrench` (6,) [N, N·m] is what the hand or the environment exerts ON the robot at the end

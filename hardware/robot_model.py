@@ -64,7 +64,7 @@ class UrdfArm:
 RobotDescription = PlanarArm | UrdfArm
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)  # frozen, it would take three times as long to make
 class RobotTerms:
     """Everything one tick needs at (q, q̇), n joints, z task axes, SI, base axes.
 
@@ -79,13 +79,22 @@ class RobotTerms:
     X_dot: FloatArray  # (z,)
     J: FloatArray  # (z, n)
     J_dot: FloatArray  # (z, n)
+    J_xyz: FloatArray  # (3, n): J, and the axes that the task ignores
+    J_xyz_dot: FloatArray  # (3, n)
     M: FloatArray  # (n, n)
     C: FloatArray  # (n, n)
     G: FloatArray  # (n,)
     origins: FloatArray  # (n + 1, 3)
-    origins_dot: FloatArray  # (n + 1, 3)
     axes: FloatArray  # (n, 3)
     axes_dot: FloatArray  # (n, 3)
+    _origins_dot: FloatArray | None = None
+
+    @property
+    def origins_dot(self) -> FloatArray:
+        """Velocities of the `origins`, (n + 1, 3); worked out when first asked for."""
+        if self._origins_dot is None:
+            self._origins_dot = _origins_dot(self.origins, self.axes, self.q_dot)
+        return self._origins_dot
 
 
 class RobotModel:
@@ -119,32 +128,38 @@ class RobotModel:
 
     def terms(self, q: FloatArray, q_dot: FloatArray) -> RobotTerms:
         """Return everything a tick needs at joint positions q (n,) and velocities q̇ (n,)."""
-        model, data, z = self._model, self._data, self.task_dimension
+        z, n = self.task_dimension, self.joints
+        J, J_dot = self.compute(q, q_dot)
+        J, J_dot = J.reshape(6, n), J_dot.reshape(6, n)
+        origins = np.array(self._points)
+        task = J[:z]
+        return RobotTerms(
+            q.copy(),
+            q_dot.copy(),
+            origins[-1, :z],
+            task.dot(q_dot),
+            task,
+            J_dot[:z],
+            J[:3],
+            J_dot[:3],
+            self._M.copy(),
+            self._C.copy(),
+            self._G.copy(),
+            origins,
+            self._axes.copy(),
+            self._axes_dot.copy(),
+        )
+
+    def compute(self, q: FloatArray, q_dot: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Let pinocchio work out all that `terms` reads; return the frame's J and J̇, (6, n)."""
+        model, data, frame = self._model, self._data, self._frame
         pin.crba(model, data, q)
         pin.computeGeneralizedGravity(model, data, q)
         pin.computeCoriolisMatrix(model, data, q, q_dot)  # last: leaves placements, J and J̇
-        pin.updateFramePlacement(model, data, self._frame)
-        frame_axes = pin.LOCAL_WORLD_ALIGNED
-        J = pin.getFrameJacobian(model, data, self._frame, frame_axes)
-        J_dot = pin.getFrameJacobianTimeVariation(model, data, self._frame, frame_axes)
-        J, J_dot = J.reshape(6, -1)[:z], J_dot.reshape(6, -1)[:z]
-        origins = np.array(self._points)
-        axes = self._axes.copy()
-        q_dot = q_dot.copy()
-        return RobotTerms(
-            q=q.copy(),
-            q_dot=q_dot,
-            X=origins[-1, :z],
-            X_dot=J @ q_dot,
-            J=J,
-            J_dot=J_dot,
-            M=self._M.copy(),
-            C=self._C.copy(),
-            G=self._G.copy(),
-            origins=origins,
-            origins_dot=_origins_dot(origins, axes, q_dot),
-            axes=axes,
-            axes_dot=self._axes_dot.copy(),
+        pin.updateFramePlacement(model, data, frame)
+        return (
+            pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED),
+            pin.getFrameJacobianTimeVariation(model, data, frame, pin.LOCAL_WORLD_ALIGNED),
         )
 
     def end_effector(
@@ -154,7 +169,7 @@ class RobotModel:
         model, data, z = self._model, self._data, self.task_dimension
         J = pin.computeFrameJacobian(model, data, q, self._frame, pin.LOCAL_WORLD_ALIGNED)
         J = J.reshape(6, -1)[:z]
-        return self._points[-1][:z].copy(), J @ q_dot, J
+        return self._points[-1][:z].copy(), J.dot(q_dot), J
 
     def forward_dynamics(
         self, q: FloatArray, q_dot: FloatArray, torque: FloatArray, force: FloatArray | None = None

@@ -1,7 +1,5 @@
 """A device whose wrench is measured by a force sensor."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from hardware.interface import Device, DeviceError, DeviceState, FloatArray, ForceSensor, JointStops
@@ -64,7 +62,7 @@ class SensedDevice:
         if self._turns:
             R = self._model.orientation(state.position_rad)
             wrench = np.concatenate((R @ wrench[:3], R @ wrench[3:]))
-        return replace(state, wrench=wrench)
+        return state._replace(wrench=wrench)
 
     def write(self, torque_nm: FloatArray) -> None:
         """Command joint torques (n,) [N·m]."""

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -81,6 +81,16 @@ class SimulatedSettings:
         return self.velocity_filter_s if self.encoder_resolution_rad > 0.0 else None
 
 
+class _Touched(NamedTuple):
+    """What a contact did to the arm in one state; its arrays are never written into."""
+
+    time_s: float
+    q: FloatArray  # (n,)
+    q_dot: FloatArray  # (n,)
+    force_n: FloatArray  # (z,)
+    torque_nm: FloatArray  # (n,)
+
+
 class SimulatedDevice:
     """An arm that obeys M q̈ + C q̇ + G = τ + JᵀF and the given imperfections; a `Device`.
 
@@ -151,8 +161,8 @@ class SimulatedDevice:
         position, velocity = self._measure(now_ns)
         wrench = np.zeros(6)
         if self._contact is not None:
-            X, X_dot, _ = self._model.end_effector(self._q, self._q_dot)
-            wrench[: len(X)] = self._contact.force_n(self._session_s(now_ns), X, X_dot)
+            force_n = self._touch(self._contact, self._session_s(now_ns), self._q, self._q_dot)[0]
+            wrench[: len(force_n)] = force_n
         if self._settings.force_noise_n > 0.0:
             z = self._model.task_dimension
             wrench[:z] += self._settings.force_noise_n * self._random.standard_normal(z)
@@ -167,7 +177,7 @@ class SimulatedDevice:
             raise DeviceError("torque refused: the outputs are off; call enable() first")
         if torque_nm.shape != (self.joints,):
             raise DeviceError(f"torque refused: shape {torque_nm.shape}, not ({self.joints},)")
-        if not np.isfinite(torque_nm).all():
+        if not all(map(math.isfinite, torque_nm.tolist())):
             raise DeviceError(f"torque refused: {torque_nm} N·m is not finite")
         limit = self._settings.torque_limit_nm
         torque = torque_nm.copy() if limit is None else np.clip(torque_nm, -limit, limit)
@@ -193,6 +203,7 @@ class SimulatedDevice:
         self._q_dot = np.zeros(self.joints)
         self._zero_torque()
         self._friction = np.zeros(self.joints)
+        self._touched: _Touched | None = None
         self._encoder_rad: FloatArray | None = None
         self._measured_ns = 0
         self._filtered_rad_s = np.zeros(self.joints)
@@ -234,7 +245,7 @@ class SimulatedDevice:
         for step in range(steps):
             q, q_dot = self._step(start_s + step * step_s, step_s)
             # Written so that a NaN too counts as diverged.
-            if not np.abs(q_dot).max() < DIVERGED_RAD_S:
+            if not math.hypot(*q_dot.tolist()) < DIVERGED_RAD_S:
                 raise DeviceError(
                     f"the simulation diverged at {start_s:.3f} s: joint velocity {q_dot} rad/s is "
                     f"beyond {DIVERGED_RAD_S:g}; lower the gains or step_s "
@@ -245,11 +256,26 @@ class SimulatedDevice:
     def _acceleration(
         self, time_s: float, q: FloatArray, q_dot: FloatArray, torque: FloatArray
     ) -> FloatArray:
-        torque = torque - self._settings.viscous_friction_nm_s * q_dot
+        if self._settings.viscous_friction_nm_s > 0.0:
+            torque = torque - self._settings.viscous_friction_nm_s * q_dot
         if self._contact is not None:
-            X, X_dot, J = self._model.end_effector(q, q_dot)
-            torque += J.T @ self._contact.force_n(time_s, X, X_dot)
+            torque = torque + self._touch(self._contact, time_s, q, q_dot)[1]
         return self._model.forward_dynamics(q, q_dot, torque)
+
+    def _touch(
+        self, contact: ContactForce, time_s: float, q: FloatArray, q_dot: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the contact's force F (z,) and JᵀF (n,).
+
+        Asked again for the same state, as the first step after a reading does, it remembers.
+        """
+        last = self._touched
+        if last is not None and last.q is q and last.q_dot is q_dot and last.time_s == time_s:
+            return last.force_n, last.torque_nm
+        X, X_dot, J = self._model.end_effector(q, q_dot)
+        force_n = contact.force_n(time_s, X, X_dot)
+        self._touched = _Touched(time_s, q, q_dot, force_n, torque_nm := J.T.dot(force_n))
+        return force_n, torque_nm
 
     def _step_semi_implicit(self, time_s: float, step_s: float) -> tuple[FloatArray, FloatArray]:
         acceleration = self._acceleration(time_s, self._q, self._q_dot, self._torque)

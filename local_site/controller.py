@@ -26,6 +26,6 @@ class LocalController:
     ) -> Command:
         """Return the torque toward the remote robot's delayed position (z,) [m]."""
         force = force_share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_l)
-        zeta = np.zeros_like(terms.q)
+        zeta = np.zeros(len(terms.q))
         torque, _ = control_torque(terms, force, self.damping, zeta, zeta)
         return Command(torque, -force)

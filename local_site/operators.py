@@ -20,11 +20,11 @@ from site_runtime.session import (
 FloatArray = npt.NDArray[np.float64]
 
 
-def build_operator(settings: OperatorSettings, dimension: int) -> ContactForce:
-    """Build the operator that a session file describes."""
+def build_operator(settings: OperatorSettings, dimension: int) -> ContactForce | None:
+    """Build the operator that a session file describes; None if there is none."""
     match settings:
         case NoOperator():
-            return ConstantForce(np.zeros(dimension), 0.0)
+            return None
         case ConstantOperator():
             return ConstantForce(np.array(settings.force_n), settings.start_s)
         case PulsesOperator():

@@ -1,6 +1,7 @@
 """The remote robot's law: (4)–(6) with a sub-task in the null space of its Jacobian."""
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
@@ -35,13 +36,17 @@ class RemoteController:
         force = force_share * self.coupling.force(terms.X - peer_position_m)  # (3), ΩP(e_r)
         zeta, zeta_dot = self.reference(terms, engaged_s)
         torque, s = control_torque(terms, force, self.damping, zeta, zeta_dot)  # (6)
-        error = project(terms.J, s, self.regularisation) if self.sub_task is not None else None
-        return Command(torque, -force, 0.0 if error is None else float(np.sqrt(error @ error)))
+        error_rad_s = 0.0
+        if self.sub_task is not None:
+            error = project(terms.J, s, self.regularisation)  # (21)
+            error_rad_s = sqrt(error.dot(error))
+        return Command(torque, -force, error_rad_s)
 
     def reference(self, terms: RobotTerms, engaged_s: float) -> tuple[FloatArray, FloatArray]:
         """Return ζ and ζ̇ of (4), (n,): the sub-task's gradient, ramped in, in the null space."""
         if self.sub_task is None:
-            return np.zeros_like(terms.q), np.zeros_like(terms.q)
+            rest = np.zeros(len(terms.q))
+            return rest, rest
         ramp = smooth_ramp(engaged_s, self.sub_task_ramp_s)
-        g, g_dot = ramped(*self.sub_task.evaluate(terms), ramp)
+        g, g_dot = ramped(self.sub_task.evaluate(terms), ramp)
         return null_space_velocity(terms.J, terms.J_dot, g, g_dot, self.regularisation)

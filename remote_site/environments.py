@@ -11,8 +11,10 @@ from site_runtime.session import EnvironmentSettings, WallSettings
 FloatArray = npt.NDArray[np.float64]
 
 
-def build_environment(settings: EnvironmentSettings, dimension: int) -> ContactForce:
-    """Build the environment that a session file describes; without walls, free space."""
+def build_environment(settings: EnvironmentSettings, dimension: int) -> ContactForce | None:
+    """Build the environment that a session file describes; None is free space."""
+    if not settings.walls:
+        return None
     return Walls(tuple(Wall.of(wall) for wall in settings.walls), dimension)
 
 

@@ -74,9 +74,9 @@ def assemble(
     identity: SiteId,
     surroundings: Surroundings,
     controller: Controller,
-    contact: ContactForce,
+    contact: ContactForce | None,
 ) -> Site:
-    """Build one site of a session around its controller and what touches its robot."""
+    """Build one site of a session around its controller and whatever touches its robot."""
     own = session.site(identity)
     inbound = (
         session.channel.remote_to_local

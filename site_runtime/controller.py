@@ -1,7 +1,6 @@
 """What a site asks of its controller."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -11,8 +10,7 @@ from hardware.robot_model import RobotTerms
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """One step's result: torque (n,) [N·m] and what people want to see of it.
 
     `coupling_force_n` (z,) is −ΩP(e), the force that the coupling exerts on this robot.

@@ -85,20 +85,23 @@ class Guard:
     def reading(self, reading: DeviceState) -> None:
         """Let a finite reading pass; raises GuardError on any other, driven or not."""
         self.cut = Cut.NONE
+        q, q_dot, wrench = reading.position_rad, reading.velocity_rad_s, reading.wrench
+        if isfinite(q.dot(q) + q_dot.dot(q_dot) + wrench.dot(wrench)):
+            return
         for name, values in (
-            ("joint position", reading.position_rad),
-            ("joint velocity", reading.velocity_rad_s),
-            ("wrench", reading.wrench),
+            ("joint position", q),
+            ("joint velocity", q_dot),
+            ("wrench", wrench),
         ):
             if not _finite(values):
                 raise GuardError(f"the device read a {name} of {values}: it is not finite")
 
     def target(self, position_m: FloatArray) -> FloatArray:
         """Return the nearest point of the workspace box to the peer's point, (z,)."""
-        if all(
-            low <= x <= high
-            for x, (low, high) in zip(position_m.tolist(), self._box_m, strict=True)
-        ):
+        for x, (low, high) in zip(position_m.tolist(), self._box_m, strict=True):
+            if not low <= x <= high:
+                break
+        else:
             return position_m
         self._count(Cut.WORKSPACE)
         return np.clip(position_m, self._limits.workspace_min_m, self._limits.workspace_max_m)
@@ -135,20 +138,19 @@ class Guard:
     def _forbidden(self, terms: RobotTerms) -> list[Forbidden]:
         """Return along which directions, of length 1, no torque but gravity's may act now."""
         limits, q_dot = self._limits, terms.q_dot
-        found = [
-            (Cut.VELOCITY, self._axes[joint] if speed > 0.0 else -self._axes[joint])
-            for joint, (speed, fastest) in enumerate(
-                zip(q_dot.tolist(), self._fastest_rad_s, strict=True)
-            )
-            if abs(speed) > fastest
-        ]
+        found: list[Forbidden] = []
+        for joint, speed in enumerate(q_dot.tolist()):
+            fastest = self._fastest_rad_s[joint]
+            if not -fastest <= speed <= fastest:
+                axis = self._axes[joint]
+                found.append((Cut.VELOCITY, axis if speed > 0.0 else -axis))
         if (
             limits.kinetic_energy_j < inf
-            and 0.5 * float(q_dot @ terms.M @ q_dot) > limits.kinetic_energy_j
+            and 0.5 * q_dot.dot(terms.M).dot(q_dot) > limits.kinetic_energy_j
         ):
             found.append((Cut.KINETIC_ENERGY, q_dot / sqrt(q_dot @ q_dot)))
         for outward, bound_rad in self._stops:
-            if float(outward @ terms.q) >= bound_rad:
+            if outward.dot(terms.q) >= bound_rad:
                 found.append((Cut.JOINT, outward))
         return found
 
@@ -172,10 +174,10 @@ class Guard:
         self, torque_nm: FloatArray, forbidden: list[Forbidden], gravity_nm: FloatArray
     ) -> FloatArray:
         """Cut joint by joint; but all alike where one joint's cut would leave another's unheld."""
-        if all(
-            abs(torque) <= strongest
-            for torque, strongest in zip(torque_nm.tolist(), self._strongest_nm, strict=True)
-        ):
+        for torque, strongest in zip(torque_nm.tolist(), self._strongest_nm, strict=True):
+            if not -strongest <= torque <= strongest:
+                break
+        else:
             return torque_nm
         self._count(Cut.TORQUE)
         strongest_nm = self._limits.torque_nm
@@ -198,8 +200,10 @@ class Guard:
 
     def _tally(self) -> None:
         """Let the excess grow by each tick that was cut, and shrink by each that was not."""
-        if not self.cut & _EXCESS:
-            self._excess_ticks = max(0, self._excess_ticks - 1)
+        # flags are slow to compare, and most ticks have none
+        if self.cut is Cut.NONE or not self.cut & _EXCESS:
+            if self._excess_ticks:
+                self._excess_ticks -= 1
             return
         self._excess_ticks += 1
         if self._excess_ticks > self._most_excess_ticks:

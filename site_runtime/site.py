@@ -12,7 +12,8 @@ import numpy.typing as npt
 from channel.channel import Channel, PeerSample
 from channel.packet import Reject
 from control_law.null_space import manipulability
-from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
+from control_law.sub_tasks.chain import center_3d
+from control_law.sub_tasks.obstacle_distance import distances
 from hardware.interface import Device, DeviceState
 from hardware.robot_model import RobotModel, RobotTerms
 from site_runtime.clock import Clock, LatenessHistogram, Pacer
@@ -94,14 +95,14 @@ class Site:
         self.ticks = 0
         self.missed = 0
         self.round_trip_s = nan
-        self.error_m = nan
+        self._apart: tuple[FloatArray, FloatArray] | None = None
         self._device = device
         self._robot = robot
         self._controller = controller
         self._supervisor = supervisor
         self._clock = clock
         self._times = times
-        self._obstacles_m = obstacles_m
+        self._obstacles_m = tuple(center_3d(centre) for centre in obstacles_m)
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
         self._late_ticks = 0
@@ -125,6 +126,11 @@ class Site:
     def scale(self) -> float:
         """Share of the gains left by de-rating, 1 if none is taken."""
         return self._supervisor.scale
+
+    @property
+    def error_m(self) -> float:
+        """Distance from the point followed [m], NaN before there is one; any thread may ask."""
+        return nan if self._apart is None else dist(*self._apart)
 
     @property
     def apart_m(self) -> float:
@@ -311,9 +317,10 @@ class Site:
         trip_ns = None if peer is None else peer.round_trip_ns
         self.round_trip_s = nan if trip_ns is None else trip_ns * 1e-9
         if target_m is not None:
-            self.error_m = dist(terms.X, target_m)
+            self._apart = (terms.X, target_m)
         counters = self.channel.counters
         self._count_rejected()
+        link_m, midpoint_m = self._nearest(terms)
         offset = self.channel.offset
         read_ns, step_ns, write_ns, sent_ns = self._stages_ns
         self.telemetry.put(
@@ -349,8 +356,8 @@ class Site:
             loop_bound_s=self.margin.loop_s,
             certified_round_trip_s=self.margin.certified_s,
             manipulability=manipulability(terms.J),
-            link_distance_m=self._nearest(segment_distance, terms.origins),
-            midpoint_distance_m=self._nearest(midpoint_distance, terms.origins),
+            link_distance_m=link_m,
+            midpoint_distance_m=midpoint_m,
             sub_task_error_rad_s=command.sub_task_error_rad_s,
             lost=counters.lost,
             late=counters.late,
@@ -387,8 +394,14 @@ class Site:
             self._rejected_total = total
             self._rejected = [min(rejected[reason], _MOST_COUNTED) for reason in Reject]
 
-    def _nearest(
-        self, distance: Callable[[FloatArray, FloatArray], float], origins_m: FloatArray
-    ) -> float:
-        """Smallest distance of the links to an obstacle [m], NaN without one."""
-        return min((distance(origins_m, centre) for centre in self._obstacles_m), default=nan)
+    def _nearest(self, terms: RobotTerms) -> tuple[float, float]:
+        """Smallest distance of links and of their midpoints to an obstacle [m], NaN without one."""
+        link_m = midpoint_m = nan
+        if self._obstacles_m:
+            points = terms.origins.tolist()
+            for centre in self._obstacles_m:
+                one_m, other_m = distances(points, centre)
+                # so written that NaN gives way
+                link_m = link_m if link_m <= one_m else one_m
+                midpoint_m = midpoint_m if midpoint_m <= other_m else other_m
+        return link_m, midpoint_m

@@ -150,10 +150,10 @@ class TelemetryStream:
             time_ns,
             lateness_ns,
             duration_ns,
-            min(read_ns, _MOST),
-            min(step_ns, _MOST),
-            min(write_ns, _MOST),
-            min(sent_ns, _MOST),
+            read_ns if read_ns < _MOST else _MOST,
+            step_ns if step_ns < _MOST else _MOST,
+            write_ns if write_ns < _MOST else _MOST,
+            sent_ns if sent_ns < _MOST else _MOST,
             state,
             peer_state,
             requests,
@@ -181,10 +181,10 @@ class TelemetryStream:
             link_distance_m,
             midpoint_distance_m,
             sub_task_error_rad_s,
-            min(lost, _MOST),
-            min(late, _MOST),
+            lost if lost < _MOST else _MOST,
+            late if late < _MOST else _MOST,
             *rejected,
-            min(missed, _MOST),
+            missed if missed < _MOST else _MOST,
         )
         self._count += 1
         self._count_row(self._count)

@@ -1,6 +1,7 @@
 """Kinematics of a revolute chain that several sub-tasks share.
 
-Vectors are plain three-tuples or lists: for a handful of joints they cost a fraction of arrays.
+Vectors are plain three-tuples or lists, and products are written out: for a handful of joints they
+cost a fraction of arrays, or of functions.
 """
 
 from collections.abc import Sequence
@@ -14,64 +15,49 @@ FloatArray = npt.NDArray[np.float64]
 Vector = Sequence[float]  # of three
 
 
-def dot(a: Vector, b: Vector) -> float:
-    """Return a·b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def cross(a: Vector, b: Vector) -> Vector:
-    """Return a×b."""
-    ax, ay, az = a
-    bx, by, bz = b
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
-    """Return a + scale·b."""
-    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
-
-
-def scaled(scale: float, a: Vector) -> Vector:
-    """Return scale·a."""
-    return scale * a[0], scale * a[1], scale * a[2]
-
-
-def minus(a: Vector, b: Vector) -> Vector:
-    """Return a − b."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
 class JointPull:
     """g = Σ J_iᵀφ_i and ġ, gathered from pulls φ_i at points x_i of the links."""
 
-    def __init__(self, terms: Terms) -> None:
-        self._joints = list(
-            zip(
-                terms.axes.tolist(),
-                terms.axes_dot.tolist(),
-                terms.origins.tolist(),
-                terms.origins_dot.tolist(),
-                strict=False,  # the last origin is the end effector
-            )
-        )
-        self._g = [0.0] * len(self._joints)
-        self._g_dot = [0.0] * len(self._joints)
+    def __init__(self, joints: int) -> None:
+        self._g = [0.0] * joints
+        self._g_dot = [0.0] * joints
+        self._joints: list[tuple[Vector, Vector, Vector, Vector]] = []
 
-    def add(self, link: int, x: Vector, x_dot: Vector, pull: Vector, pull_dot: Vector) -> None:
+    def add(
+        self, terms: Terms, link: int, x: Vector, x_dot: Vector, pull: Vector, pull_dot: Vector
+    ) -> None:
         """Add a pull φ, φ̇ at a point x, ẋ of a link, counted from 0.
 
         Column k of J is a_k×(x − o_k), k ≤ link. If x slides along the link, ẋ counts the sliding.
         """
-        for k, (axis, axis_dot, origin, origin_dot) in enumerate(self._joints[: link + 1]):
-            arm = minus(x, origin)
-            column = cross(axis, arm)
-            column_dot = plus(cross(axis_dot, arm), cross(axis, minus(x_dot, origin_dot)))
-            self._g[k] += dot(column, pull)
-            self._g_dot[k] += dot(column_dot, pull) + dot(column, pull_dot)
+        if not self._joints:  # most of the time nothing pulls
+            self._joints = list(
+                zip(
+                    terms.axes.tolist(),
+                    terms.axes_dot.tolist(),
+                    terms.origins.tolist(),
+                    terms.origins_dot.tolist(),
+                    strict=False,  # the last origin is the end effector
+                )
+            )
+        (x0, x1, x2), (v0, v1, v2) = x, x_dot
+        (p0, p1, p2), (r0, r1, r2) = pull, pull_dot
+        for k, ((a0, a1, a2), (b0, b1, b2), (o0, o1, o2), (u0, u1, u2)) in enumerate(
+            self._joints[: link + 1]
+        ):
+            d0, d1, d2 = x0 - o0, x1 - o1, x2 - o2
+            e0, e1, e2 = v0 - u0, v1 - u1, v2 - u2
+            # column a×d, column_dot ȧ×d + a×ḋ
+            c0, c1, c2 = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
+            s0 = b1 * d2 - b2 * d1 + a1 * e2 - a2 * e1
+            s1 = b2 * d0 - b0 * d2 + a2 * e0 - a0 * e2
+            s2 = b0 * d1 - b1 * d0 + a0 * e1 - a1 * e0
+            self._g[k] += c0 * p0 + c1 * p1 + c2 * p2
+            self._g_dot[k] += s0 * p0 + s1 * p1 + s2 * p2 + c0 * r0 + c1 * r1 + c2 * r2
 
-    def result(self) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
-        return np.array(self._g), np.array(self._g_dot)
+    def result(self) -> FloatArray:
+        """Return g and ġ, (2, n)."""
+        return np.array((self._g, self._g_dot))
 
 
 def center_3d(center: FloatArray) -> tuple[float, float, float]:

@@ -29,15 +29,16 @@ class WeightedSum:
         if not all(weight >= 0 for weight in self.weights):
             raise ValueError(f"weights {self.weights} must be zero or more")
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
-        g = np.zeros_like(terms.q)
-        g_dot = np.zeros_like(terms.q)
-        for task, weight in zip(self.tasks, self.weights, strict=True):
-            part, part_dot = task.evaluate(terms)
-            g += weight * part
-            g_dot += weight * part_dot
-        return g, g_dot
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g and ġ, (2, n)."""
+        total = self.tasks[0].evaluate(terms)
+        total *= self.weights[0]
+        for task, weight in zip(self.tasks[1:], self.weights[1:], strict=True):
+            part = task.evaluate(terms)
+            if weight != 1.0:
+                part *= weight
+            total += part
+        return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,18 +52,19 @@ class NormLimiter:
         if not self.ceiling_rad_s > 0:
             raise ValueError(f"ceiling {self.ceiling_rad_s} rad/s must be positive")
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
-        g, g_dot = self.task.evaluate(terms)
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g and ġ, (2, n)."""
+        wish = self.task.evaluate(terms)
+        (g2, g_g_dot), _ = wish.dot(wish.T).tolist()
         inverse = 1.0 / (self.ceiling_rad_s * self.ceiling_rad_s)
-        scale = 1.0 / sqrt(1.0 + float(g.dot(g)) * inverse)
-        scale_dot = -(scale**3) * float(g.dot(g_dot)) * inverse
-        return scale * g, scale * g_dot + scale_dot * g
+        scale = 1.0 / sqrt(1.0 + g2 * inverse)
+        return ramped(wish, (scale, -(scale**3) * g_g_dot * inverse))
 
 
-def ramped(
-    g: FloatArray, g_dot: FloatArray, ramp: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return r·g and r·ġ + ṙ·g, (n,), for a ramp (r, ṙ) as `smooth_ramp` gives it."""
+def ramped(wish: FloatArray, ramp: tuple[float, float]) -> FloatArray:
+    """Return r·g and r·ġ + ṙ·g, (2, n), for g and ġ, (2, n), and a factor r with its rate ṙ."""
     value, rate = ramp
-    return value * g, value * g_dot + rate * g
+    if value == 1.0 and rate == 0.0:
+        return wish
+    result: FloatArray = np.array(((value, 0.0), (rate, value))).dot(wish)
+    return result

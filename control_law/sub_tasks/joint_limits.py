@@ -39,6 +39,6 @@ class JointCentring:
         object.__setattr__(self, "_centre", 0.5 * (lower + upper))
         object.__setattr__(self, "_weight", weight)
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
-        return self._weight * (self._centre - terms.q), -self._weight * terms.q_dot
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g and ġ, (2, n)."""
+        return np.array((self._weight * (self._centre - terms.q), -self._weight * terms.q_dot))

@@ -25,7 +25,7 @@ class LinearSingularityAvoidance:
         if not self.gain >= 0:
             raise ValueError(f"gain {self.gain} must be zero or more")
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g and ġ, (2, n)."""
         a = self.direction
-        return (-self.gain * a.dot(terms.q)) * a, (-self.gain * a.dot(terms.q_dot)) * a
+        return np.array(((-self.gain * a.dot(terms.q)) * a, (-self.gain * a.dot(terms.q_dot)) * a))

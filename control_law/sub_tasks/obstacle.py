@@ -1,12 +1,13 @@
 """Obstacle avoidance for whole links, bounded everywhere."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import sqrt
 
 import numpy as np
 import numpy.typing as npt
 
-from control_law.sub_tasks.chain import JointPull, center_3d, dot, minus, plus, scaled
+from control_law.sub_tasks.chain import JointPull, center_3d
 from control_law.sub_tasks.obstacle_distance import closest_parameter
 from control_law.terms import Terms
 
@@ -41,28 +42,44 @@ class SegmentAvoidance:
             raise ValueError(f"gain {self.gain} must be zero or more")
         object.__setattr__(self, "_center", center_3d(self.center))
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
-        joint_pull = JointPull(terms)
-        origins, origins_dot = terms.origins.tolist(), terms.origins_dot.tolist()
-        core = _CORE * self.activation_distance_m
-        for i in range(len(origins) - 1):
-            start, link = origins[i], minus(origins[i + 1], origins[i])
-            along = closest_parameter(start, link, self._center)
-            x = plus(start, link, along)
-            offset = minus(x, self._center)
-            distance = sqrt(dot(offset, offset) + core * core)
-            depth = self.activation_distance_m - distance
-            if depth <= 0.0:
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g and ġ, (2, n)."""
+        joint_pull = JointPull(len(terms.q))
+        cx, cy, cz = self._center
+        reach = self.activation_distance_m
+        core2 = (_CORE * reach) ** 2
+        points = terms.origins.tolist()
+        for i, ((ax, ay, az), (bx, by, bz)) in enumerate(pairwise(points)):
+            lx, ly, lz = bx - ax, by - ay, bz - az
+            along = closest_parameter(ax - cx, ay - cy, az - cz, lx, ly, lz)
+            x, y, z = ax + along * lx, ay + along * ly, az + along * lz
+            ox, oy, oz = x - cx, y - cy, z - cz
+            distance2 = ox * ox + oy * oy + oz * oz + core2
+            if distance2 >= reach * reach:
                 continue
-            link_dot = minus(origins_dot[i + 1], origins_dot[i])
-            x_dot = plus(origins_dot[i], link_dot, along)
+            (ux, uy, uz), (vx, vy, vz) = terms.origins_dot[i : i + 2].tolist()
+            mx, my, mz = vx - ux, vy - uy, vz - uz  # of the link
+            vx, vy, vz = ux + along * mx, uy + along * my, uz + along * mz  # of the point
             if 0.0 < along < 1.0:
                 # The contact point slides; a link keeps its length, so λ̇ has no other term.
-                sliding = -(dot(link_dot, offset) + dot(link, x_dot)) / dot(link, link)
-                x_dot = plus(x_dot, link, sliding)
+                sliding = -(mx * ox + my * oy + mz * oz + lx * vx + ly * vy + lz * vz)
+                sliding /= lx * lx + ly * ly + lz * lz
+                vx, vy, vz = vx + sliding * lx, vy + sliding * ly, vz + sliding * lz
+            distance = sqrt(distance2)
+            depth = reach - distance
             slope = self.gain * depth * depth / distance  # the pull, −∇V, is slope·offset
-            slope_dot = -(2.0 * self.gain * depth + slope) * dot(offset, x_dot) / distance**2
-            pull_dot = plus(scaled(slope, x_dot), offset, slope_dot)
-            joint_pull.add(i, x, x_dot, scaled(slope, offset), pull_dot)
+            toward = ox * vx + oy * vy + oz * vz
+            slope_dot = -(2.0 * self.gain * depth + slope) * toward / distance2
+            joint_pull.add(
+                terms,
+                i,
+                (x, y, z),
+                (vx, vy, vz),
+                (slope * ox, slope * oy, slope * oz),
+                (
+                    slope * vx + slope_dot * ox,
+                    slope * vy + slope_dot * oy,
+                    slope * vz + slope_dot * oz,
+                ),
+            )
         return joint_pull.result()

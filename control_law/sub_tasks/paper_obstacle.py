@@ -1,11 +1,12 @@
 """The paper's obstacle avoidance, after its reference [21]."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from control_law.sub_tasks.chain import JointPull, center_3d, dot, minus, plus, scaled
+from control_law.sub_tasks.chain import JointPull, center_3d
 from control_law.terms import Terms
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,23 +38,35 @@ class StipanovicAvoidance:
             raise ValueError(f"gain {self.gain} must be zero or more")
         object.__setattr__(self, "_center", center_3d(self.center))
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g and ġ, (n,)."""
-        joint_pull = JointPull(terms)
-        origins, origins_dot = terms.origins.tolist(), terms.origins_dot.tolist()
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g and ġ, (2, n)."""
+        joint_pull = JointPull(len(terms.q))
+        cx, cy, cz = self._center
         safe2, collision2 = self.safe_radius_m**2, self.collision_radius_m**2
         band = safe2 - collision2
-        for link in range(len(origins) - 1):
-            x = scaled(0.5, plus(origins[link], origins[link + 1]))
-            offset = minus(x, self._center)
-            distance2 = dot(offset, offset)
+        points = terms.origins.tolist()
+        for link, ((ax, ay, az), (bx, by, bz)) in enumerate(pairwise(points)):
+            x, y, z = 0.5 * (ax + bx), 0.5 * (ay + by), 0.5 * (az + bz)
+            ox, oy, oz = x - cx, y - cy, z - cz
+            distance2 = ox * ox + oy * oy + oz * oz
             if not collision2 < distance2 < safe2:
                 continue
-            x_dot = scaled(0.5, plus(origins_dot[link], origins_dot[link + 1]))
+            (ux, uy, uz), (vx, vy, vz) = terms.origins_dot[link : link + 2].tolist()
+            vx, vy, vz = 0.5 * (ux + vx), 0.5 * (uy + vy), 0.5 * (uz + vz)
             gap = distance2 - collision2
             scale = -4.0 * self.gain * band / gap**3
             slope = scale * (distance2 - safe2)  # the pull, −κ∇V, is slope·offset
-            slope_dot = (scale - 3.0 * slope / gap) * 2.0 * dot(offset, x_dot)
-            pull_dot = plus(scaled(slope, x_dot), offset, slope_dot)
-            joint_pull.add(link, x, x_dot, scaled(slope, offset), pull_dot)
+            slope_dot = (scale - 3.0 * slope / gap) * 2.0 * (ox * vx + oy * vy + oz * vz)
+            joint_pull.add(
+                terms,
+                link,
+                (x, y, z),
+                (vx, vy, vz),
+                (slope * ox, slope * oy, slope * oz),
+                (
+                    slope * vx + slope_dot * ox,
+                    slope * vy + slope_dot * oy,
+                    slope * vz + slope_dot * oz,
+                ),
+            )
         return joint_pull.result()

@@ -13,8 +13,8 @@ FloatArray = npt.NDArray[np.float64]
 class SubTask(Protocol):
     """A wish about the pose, as a joint velocity the null space may follow (Section V)."""
 
-    def evaluate(self, terms: Terms) -> tuple[FloatArray, FloatArray]:
-        """Return g [rad/s] and its time derivative ġ along the motion, both (n,). Real-time safe.
+    def evaluate(self, terms: Terms) -> FloatArray:
+        """Return g [rad/s] and its time derivative ġ along the motion, (2, n). Real-time safe.
 
-        Both are fresh arrays.
+        A fresh array, the caller's to change.
         """

@@ -59,6 +59,15 @@ class Authority:
         """Every identity that ever was."""
         return tuple(self._issued)
 
+    @property
+    def allowed(self) -> tuple[str, ...]:
+        """Common names that are not revoked."""
+        return tuple(
+            identity.common_name(issued.generation)
+            for identity, issued in self._issued.items()
+            if not issued.revoked
+        )
+
     def issue(self, identity: Identity, hosts: Iterable[str], life: timedelta = LIFE) -> str:
         """Make the first certificate of an identity, or a new one; return its common name.
 
@@ -103,14 +112,9 @@ class Authority:
         }
         path = self.folder / AUTHORITY / _ISSUED_FILE
         write_private(path, json.dumps(content, indent=2).encode())
-        allowed = [
-            one.common_name(state.generation)
-            for one, state in self._issued.items()
-            if not state.revoked
-        ]
         for one in self._issued:
             if (place := self.folder / one.name).is_dir():
-                write_allowed(place / ALLOWED_FILE, allowed)
+                write_allowed(place / ALLOWED_FILE, self.allowed)
 
     def _sign(
         self,

@@ -66,7 +66,7 @@ def meet_as_site(
     if operator is not None and not local:
         raise SecurityError(f"--as {operator}: an operator is at the local site, not here")
     if network.router is not None:
-        listens, dials = [], [_wide_area(Endpoint("network.router", network.router))]
+        listens, dials = [], [Endpoint("network.router", network.router)]
     else:
         own = "local_listen" if local else "remote_listen"
         listens = [Endpoint(f"network.{own}", getattr(network, own))]
@@ -87,7 +87,7 @@ def meet_as_observer(
     if connect:
         dials = [Endpoint("--connect", text) for text in connect]
     elif network.router is not None:
-        dials = [_wide_area(Endpoint("network.router", network.router))]
+        dials = [Endpoint("network.router", network.router)]
     else:
         dials = [
             Endpoint(f"network.{key}", getattr(network, key))
@@ -103,7 +103,7 @@ def meet_as_router(session: Session, listen: Sequence[str] | None = None) -> Mee
             "network.router is missing: it tells where the relay is, "
             'such as "quic/relay.example:7447"'
         )
-    listens = [_wide_area(Endpoint("network.router", session.network.router))]
+    listens = [Endpoint("network.router", session.network.router)]
     if listen:
         listens = [Endpoint("--listen", text) for text in listen]
     return _meet(session, ROUTER, listens, [])
@@ -162,6 +162,8 @@ def _meet(
     elif network.router is not None:
         # peers of regions of their own, not clients: those cannot start before the router does
         configuration["region_name"] = _region(own).value
+    if network.router is not None:
+        listens, dials = [*map(_wide_area, listens)], [*map(_wide_area, dials)]
     warnings = _require_secrecy(network.allow_plaintext, [*listens, *dials])
     if credentials is not None and (left := credentials.left()) < NEAR:
         warnings.append(

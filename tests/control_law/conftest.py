@@ -18,6 +18,8 @@ class ChainTerms:
     X_dot: FloatArray
     J: FloatArray
     J_dot: FloatArray
+    J_xyz: FloatArray
+    J_xyz_dot: FloatArray
     M: FloatArray
     C: FloatArray
     G: FloatArray
@@ -77,7 +79,7 @@ class Chain:
         G = -self.mass * (J @ self.gravity).sum(0)
         return ChainTerms(
             q, q_dot, origins[-1, :z], origins_dot[-1, :z], J[-1].T[:z], J_dot[-1].T[:z],
-            M, C, G, origins, origins_dot, axes, axes_dot,
+            J[-1].T, J_dot[-1].T, M, C, G, origins, origins_dot, axes, axes_dot,
         )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from control_law.control import control_torque, reference_error, theta
+from control_law.control import control_torque, minus_theta, reference_error
 from control_law.coupling import Coupling
 from control_law.damping import Damping
 from control_law.null_space import null_space_velocity
@@ -60,6 +60,6 @@ def test_theta_is_5(planar_chain: Callable[..., Any], random_motion: Callable[..
     terms = planar_chain(3).terms(*random_motion(0, 3)(0.0))
     zeta, zeta_dot = np.array([0.1, 0.2, -0.3]), np.array([1.0, -2.0, 3.0])
     np.testing.assert_allclose(
-        theta(terms.M, terms.C, terms.G, zeta, zeta_dot),
+        -minus_theta(terms.M, terms.C, terms.G, zeta, zeta_dot),
         -terms.M @ zeta_dot - terms.C @ zeta - terms.G,
     )

@@ -203,12 +203,12 @@ class Plant:
             raise ValueError(
                 f"{site.label}.device must be simulated: the plant is what it describes"
             )
-        contact = (
+        contact: ContactForce | None = (
             build_operator(session.local.operator, session.task.dimension)
             if site is SiteId.LOCAL
             else build_environment(session.remote.environment, session.task.dimension)
         )
-        self._contact = Waiting(contact)
+        self._contact = None if contact is None else Waiting(contact)
         self._device = SimulatedDevice(
             robot_of(session, site),
             replace(settings, encoder_resolution_rad=0.0),
@@ -235,7 +235,7 @@ class Plant:
             )
         )
         motor_nm = self.memory.torque_nm()
-        if self._contact.start_s is None and motor_nm.any():
+        if self._contact is not None and self._contact.start_s is None and motor_nm.any():
             self._contact.start_s = state.stamp_ns * 1e-9
         self._device.write(self._to_device.T @ motor_nm)
         self.memory.note_applied(motor_nm)

@@ -69,6 +69,7 @@ def test_once_more_adds_who_is_new_and_leaves_the_others(session: Path) -> None:
     code, said = run("keys", session, "--observer", "lab")
     assert code == 0
     assert "remote: is there already" in said
+    assert "allowed.json" in said
     assert load_credentials(folder, Identity("remote")).fingerprint == before.fingerprint
     assert "observer.lab-1" in load_credentials(folder, Identity("remote")).allowed
 
@@ -87,6 +88,8 @@ def test_revoke_renew_and_show(session: Path) -> None:
     assert code == 0
     assert "remote-2" in said
     assert "local-1" in said
+    assert "allowed.json" in said
+    assert "allowed.json" not in run("keys", "renew", session, "local")[1]  # nothing new in them
     credentials = load_credentials(session.parent / "keys", Identity("remote"))
     assert credentials.fingerprint in run("keys", "show", session)[1]
     allowed = read_allowed(session.parent / "keys" / "router" / ALLOWED_FILE)
@@ -127,3 +130,15 @@ def test_nobody_starts_without_his_keys(session: Path, command: list[str]) -> No
     code, said = run(*command, session, "--duration", "1")
     assert code == 2
     assert "farhand keys" in said
+
+
+def test_without_its_authority_a_folder_of_keys_is_left_alone(session: Path) -> None:
+    run("keys", session)
+    folder = session.parent / "keys"
+    (folder / "authority").rename(session.parent / "locked away")
+    before = {path: path.read_bytes() for path in folder.rglob("*.*")}
+    code, said = run("keys", session)
+    assert code == 2
+    assert "bring it back" in said
+    assert {path: path.read_bytes() for path in folder.rglob("*.*")} == before
+    assert run("keys", "show", session)[0] == 0

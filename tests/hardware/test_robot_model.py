@@ -232,6 +232,7 @@ def test_shapes(name: str) -> None:
         **dict.fromkeys(("q", "q_dot", "G"), (n,)),
         **dict.fromkeys(("X", "X_dot"), (z,)),
         **dict.fromkeys(("J", "J_dot"), (z, n)),
+        **dict.fromkeys(("J_xyz", "J_xyz_dot"), (3, n)),
         **dict.fromkeys(("M", "C"), (n, n)),
         **dict.fromkeys(("origins", "origins_dot"), (n + 1, 3)),
         **dict.fromkeys(("axes", "axes_dot"), (n, 3)),
@@ -245,14 +246,16 @@ def test_shapes(name: str) -> None:
 def test_terms_are_the_callers_to_keep(name: str) -> None:
     robot = ROBOTS[name]
     q, q_dot = np.full(robot.joints, 0.3), np.full(robot.joints, -0.7)
-    kept = robot.terms(q, q_dot)
-    before = {field: getattr(kept, field).copy() for field in kept.__slots__}
+    kept, asked_later = robot.terms(q, q_dot), robot.terms(q, q_dot)
+    names = [name for name in kept.__slots__ if not name.startswith("_")] + ["origins_dot"]
+    before = {field: getattr(kept, field).copy() for field in names}
     q += 1.0
     q_dot += 1.0
     robot.terms(q, q_dot)
     robot.forward_dynamics(q, q_dot, q)
     for field, value in before.items():
         np.testing.assert_array_equal(getattr(kept, field), value, err_msg=field)
+        np.testing.assert_array_equal(getattr(asked_later, field), value, err_msg=field)
 
 
 def test_a_wrong_number_of_joints_is_refused() -> None:

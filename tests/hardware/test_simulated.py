@@ -326,6 +326,15 @@ def test_actuators_saturate() -> None:
     assert ticks(device, clock, 1)[-1, 1, 0] == pytest.approx(0.0, abs=1e-15)
 
 
+def test_any_finite_torque_is_taken_and_no_other() -> None:
+    device, clock = running(planar(2), torque_limit_nm=0.01)
+    device.write(np.array([1e200, -1e200]))
+    assert ticks(device, clock, 1)[-1, 1, 0] > 0.0
+    for bad in (math.nan, math.inf, -math.inf):
+        with pytest.raises(DeviceError, match="not finite"):
+            device.write(np.array([0.0, bad]))
+
+
 def test_noise_has_the_size_asked_for() -> None:
     device, clock = running(planar(2), velocity_noise_rad_s=0.2, force_noise_n=0.5)
     states = []
@@ -543,13 +552,41 @@ def test_a_long_wait_is_cut_and_counted() -> None:
     assert late.skipped_ns == 1000 * MS  # braked time is not simulated, so none is lost
 
 
+def test_a_contact_is_asked_anew_whenever_the_state_or_the_time_is_another() -> None:
+    contact = Push(lambda t, X, X_dot: np.array([t, 0.0]) - X_dot)
+    device, clock = running(planar(2), contact)
+    moving = ticks(device, clock, 5)[-1]
+    held_n = device.read().wrench[:2]
+    assert len(contact.asked) == 6  # five steps, the first before any reading
+    device.stop()  # the brakes change the velocity only
+    braked_n = device.read().wrench[:2]
+    assert len(contact.asked) == 7
+    assert np.abs(moving[1]).max() > 0.0
+    assert (braked_n != held_n).any()
+    clock.ns += MS  # and only time passes
+    assert device.read().wrench[0] == pytest.approx(0.006)
+    assert len(contact.asked) == 8
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "rk4"])
+def test_reading_between_steps_changes_no_bit_of_the_motion(integrator: str) -> None:
+    """The contact of a reading serves the step after it: as if it had been asked again."""
+    read_often, often_clock = running(planar(2), Push(wall), integrator=integrator)
+    read_once, once_clock = running(planar(2), Push(wall), integrator=integrator)
+    ticks(read_often, often_clock, 50)
+    ticks(read_once, once_clock, 1, 50 * MS)
+    one, other = read_often.read(), read_once.read()
+    np.testing.assert_array_equal(one.position_rad, other.position_rad)
+    np.testing.assert_array_equal(one.velocity_rad_s, other.velocity_rad_s)
+
+
 def test_contact_sees_session_time() -> None:
     contact = constant(0.0, 0.0)
     start_ns = 5_000_000_000_123
     device, clock = running(planar(2), contact, start_ns=start_ns)
     ticks(device, clock, 2, 2 * MS)
     times = [time_s for time_s, _, _ in contact.asked]
-    assert times == pytest.approx([0.0, 0.001, 0.002, 0.002, 0.003, 0.004], abs=1e-15)
+    assert times == pytest.approx([0.0, 0.001, 0.002, 0.003, 0.004], abs=1e-15)
 
 
 def test_runs_repeat_bit_for_bit() -> None:

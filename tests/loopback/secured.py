@@ -1,6 +1,5 @@
 """A session whose parties show certificates: its keys, its daemons, its relay, and intruders."""
 
-import os
 import shutil
 import socket
 import subprocess
@@ -208,14 +207,13 @@ class SecuredPair:
 
 
 def ended(file: Path, site: SiteId, *options: str) -> tuple[int, str]:
-    """Run a site that cannot start; return its exit code and its words."""
+    """Run a site that ends by itself; return its exit code and what it says on stderr."""
     done = subprocess.run(
         [sys.executable, "-m", f"{site.label}_site", str(file), "--no-record", *options],
         cwd=ROOT,
-        env=os.environ,
         capture_output=True,
         text=True,
         timeout=DEADLINE_S,
         check=False,
     )
-    return done.returncode, " ".join(done.stderr.split())
+    return done.returncode, done.stderr

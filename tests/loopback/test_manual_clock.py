@@ -70,6 +70,8 @@ def test_free_arms_meet_by_the_demos_gains(apart: Session) -> None:
         assert (rows["state"] == State.ENGAGED).all()  # from session time zero on
         assert np.abs(rows["velocity_m_s"][-1]).max() < 1e-3
         assert (rows["cut"] == 0).all()
+        assert (np.diff(rows["sequence"]) == 1).all()
+        assert rows["time_ns"].tolist() == list(range(0, 3_000_000_001, 1_000_000))
 
 
 def test_a_wall_pushes_back_on_the_hand_as_hard_as_the_hand_pushes(
@@ -332,7 +334,7 @@ def test_a_simulation_ends_where_a_site_fails(apart: Session) -> None:
     step = simulation.remote._controller.step
 
     def fails_later(*arguments: object) -> object:
-        if len(simulation._batches[1]) > 5:
+        if simulation.remote.ticks > 555:
             raise ArithmeticError("the controller broke")
         return step(*arguments)
 
@@ -341,7 +343,8 @@ def test_a_simulation_ends_where_a_site_fails(apart: Session) -> None:
     )
     run = simulation.run(2.0)
     assert run.failures == ("remote: ArithmeticError: the controller broke",)
-    assert len(run.local) == len(run.remote) < 2000
+    assert 300 < len(run.local) == len(run.remote) < 555
+    assert run.remote["sequence"][-1] == 555  # the last before the tick that failed
     assert np.array_equal(run.local["time_ns"], run.remote["time_ns"])
 
 

@@ -1,8 +1,10 @@
 """Nobody uninvited: two daemons with certificates, and all who try without the right one."""
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,7 @@ from tests.loopback.secured import (
     LOOPBACK,
     SecuredPair,
     dialling,
+    ended,
     free_port,
     make_keys,
     tls,
@@ -159,3 +162,45 @@ def test_who_listens_in_the_remotes_place_is_not_heard(impostor: str, tmp_path: 
         assert link.receive() == []
         assert mouth.receive() == []
         assert not link.peer_present()
+
+
+def test_a_connection_ends_with_the_certificate_that_opened_it(tmp_path: Path) -> None:
+    authority = make_keys(tmp_path / "keys")
+    authority.issue(Identity("local"), LOOPBACK, life=timedelta(seconds=4))
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    file = write_session(
+        tmp_path / "session.toml",
+        tmp_path / "keys",
+        local_listen=f"tls/127.0.0.1:{free_port()}",
+        remote_listen=endpoint,
+        local_connect=endpoint,
+    )
+    session = load_session(file)
+    with (
+        closing(ZenohNode(meet_as_site(session, REMOTE).settings)) as remote,
+        closing(ZenohNode(meet_as_site(session, LOCAL).settings)),
+    ):
+        until(lambda: remote.partners() == ("local-1",), "a connection")
+        until(lambda: remote.partners() == (), "its end")
+        assert never_connects(remote)
+
+
+def test_a_daemon_warns_of_a_certificate_near_its_end_and_refuses_a_wrong_one(
+    tmp_path: Path,
+) -> None:
+    keys = tmp_path / "keys"
+    make_keys(keys).issue(Identity("remote"), LOOPBACK, life=timedelta(days=9, hours=1))
+    file = write_session(
+        tmp_path / "session.toml", keys, remote_listen=f"tls/127.0.0.1:{free_port()}"
+    )
+    options = ["--duration", "0.2", "--log", "json"]
+    code, said = ended(file, REMOTE, *options)
+    lines = [json.loads(line) for line in said.splitlines()]
+    assert code == 0
+    assert [line["level"] for line in lines if "expires in 9 days" in line["text"]] == ["WARN"]
+    (keys / "remote" / "private_key.pem").chmod(0o640)
+    code, said = ended(file, REMOTE, *options)
+    (line,) = [json.loads(line) for line in said.splitlines()]
+    assert code == 2
+    assert line["level"] == "ERROR"
+    assert "open to others" in line["text"]

@@ -55,8 +55,8 @@ def test_ramp_fades_in_with_its_own_rate(
 ) -> None:
     motion, chain, h = random_motion(3, 3), planar_chain(3), 1e-6
 
-    def faded(t: float) -> tuple[FloatArray, FloatArray]:
-        return ramped(*CLIMB.evaluate(chain.terms(*motion(t))), smooth_ramp(t, 0.5))
+    def faded(t: float) -> FloatArray:
+        return ramped(CLIMB.evaluate(chain.terms(*motion(t))), smooth_ramp(t, 0.5))
 
     assert not faded(0.0)[0].any()
     difference = (faded(0.2 + h)[0] - faded(0.2 - h)[0]) / (2 * h)

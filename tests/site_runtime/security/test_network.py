@@ -188,6 +188,8 @@ def test_at_a_router_everybody_dials_it_and_only_it_listens(
     relay = meet_as_router(loaded)
     assert relay.settings.listen == ("quic/127.0.0.1:7447?mixed_rel=1",)
     assert relay.settings.connect == ()
+    elsewhere = meet_as_router(loaded, ["quic/0.0.0.0:7447"])
+    assert elsewhere.settings.listen == ("quic/0.0.0.0:7447?mixed_rel=1",)
     assert relay.settings.configuration["mode"] == "router"
     assert relay.settings.tier == 1
 

@@ -1,0 +1,1 @@
+"""What farhand costs, measured side by side with what it cannot avoid."""
