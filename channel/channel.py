@@ -199,6 +199,13 @@ class Channel:
         self.counters.sent += 1
         return True
 
+    def welcome_back(self) -> None:
+        """Let runs of the peer that another has replaced come back. Real-time safe.
+
+        For where more than their epoch tells a live run from a recording: certificates, a lease.
+        """
+        self._replaced.clear()
+
     @property
     def send_period_ns(self) -> int:
         """Time between two packets at present [ns]."""

@@ -125,6 +125,7 @@ class NetworkSettings:
     security: Literal["none", "mtls"] = "none"
     keys: str | None = None
     router: Locator | None = None
+    operator_silence_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
     allow_plaintext: bool = False
 
 
