@@ -10,9 +10,6 @@ import numpy.typing as npt
 
 from channel.channel import Channel, PeerSample
 from channel.packet import Reject
-from control_law.null_space import manipulability
-from control_law.sub_tasks.chain import center_3d
-from control_law.sub_tasks.obstacle_distance import distances
 from hardware.interface import Device, DeviceState
 from hardware.robot_model import RobotModel, RobotTerms
 from site_runtime.clock import Clock, LatenessHistogram, Pacer
@@ -60,7 +57,6 @@ class Site:
     """Device, channel, controller, supervisor and guard of one side of the teleoperation.
 
     The same object runs in a daemon on a steady clock and in simulation on a manual one.
-    `obstacles_m` are centres (z,) each.
     """
 
     def __init__(
@@ -78,7 +74,6 @@ class Site:
         clock: Clock,
         times: SiteTimes,
         requests: OperatorRequests,
-        obstacles_m: tuple[FloatArray, ...],
     ) -> None:
         self.identity = identity
         self.channel = channel
@@ -98,7 +93,6 @@ class Site:
         self._supervisor = supervisor
         self._clock = clock
         self._times = times
-        self._obstacles_m = tuple(center_3d(centre) for centre in obstacles_m)
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
         self._late_ticks = 0
@@ -311,7 +305,6 @@ class Site:
             self._apart = (terms.X, target_m)
         counters = self.channel.counters
         self._count_rejected()
-        link_m, midpoint_m = self._nearest(terms)
         offset = self.channel.offset
         read_ns, step_ns, write_ns, sent_ns = self._stages_ns
         self.telemetry.put(
@@ -346,9 +339,6 @@ class Site:
             round_trip_s=self.round_trip_s,
             loop_bound_s=self.margin.loop_s,
             certified_round_trip_s=self.margin.certified_s,
-            manipulability=manipulability(terms.J),
-            link_distance_m=link_m,
-            midpoint_distance_m=midpoint_m,
             sub_task_error_rad_s=command.sub_task_error_rad_s,
             lost=counters.lost,
             late=counters.late,
@@ -384,15 +374,3 @@ class Site:
         if total != self._rejected_total:
             self._rejected_total = total
             self._rejected = [min(rejected[reason], _MOST_COUNTED) for reason in Reject]
-
-    def _nearest(self, terms: RobotTerms) -> tuple[float, float]:
-        """Smallest distance of links and of their midpoints to an obstacle [m], NaN without one."""
-        link_m = midpoint_m = nan
-        if self._obstacles_m:
-            points = terms.origins.tolist()
-            for centre in self._obstacles_m:
-                one_m, other_m = distances(points, centre)
-                # so written that NaN gives way
-                link_m = link_m if link_m <= one_m else one_m
-                midpoint_m = midpoint_m if midpoint_m <= other_m else other_m
-        return link_m, midpoint_m

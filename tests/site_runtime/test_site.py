@@ -211,7 +211,6 @@ class Bench:
             clock=self.clock,
             times=SiteTimes(MS, send_every * MS, 3 * MS, LATE_HOLD, LATE_FAULT),
             requests=self.requests,
-            obstacles_m=(np.array([0.0, 0.5]),),
         )
         self.site.open()
 
@@ -343,12 +342,6 @@ def test_the_row_tells_what_was_done(bench: Bench) -> None:
     assert np.allclose(row["coupling_force_n"], bench.peer_position - terms.X)
     assert np.array_equal(row["peer_position_m"], bench.peer_position)
     assert row["sub_task_error_rad_s"] == 0.25
-    assert row["manipulability"] == pytest.approx(np.linalg.det(terms.J @ terms.J.T))
-    middles = 0.5 * (terms.origins[1:, :2] + terms.origins[:-1, :2])
-    assert row["midpoint_distance_m"] == pytest.approx(
-        np.linalg.norm(middles - [0.0, 0.5], axis=1).min()
-    )
-    assert row["link_distance_m"] <= row["midpoint_distance_m"]
     assert row["certified_round_trip_s"] == CERTIFIED_S
     assert row["round_trip_s"] == pytest.approx(1e-3)  # sent, used at the peer's next tick, back
     assert bench.site.error_m == pytest.approx(np.linalg.norm(bench.peer_position - terms.X))
