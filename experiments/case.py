@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from experiments.measures import Measures, energy_trace_j, measure
 from experiments.simulation import Run, Simulation
+from site_runtime.derived import derivation
 from site_runtime.session import Session, parse_session
 from site_runtime.session_edit import TomlValue, edited
 from telemetry.result_file import Result, read_result, write_result
@@ -121,6 +122,7 @@ def run_case(case: Case) -> bytes:
             "energy_j": json.dumps(energy_j[::every].tolist()),
             "failures": json.dumps(run.failures),
         },
+        derivation(session),
     )
     return file.getvalue()
 

@@ -11,6 +11,7 @@ from control_law.lyapunov import LyapunovKrasovskii, SiteMotion
 from experiments.simulation import Run
 from hardware.robot_model import RobotTerms
 from remote_site.site import build_remote_controller
+from site_runtime.derived import derivation
 from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of, robot_of
 from site_runtime.session import Session
@@ -51,6 +52,9 @@ def measure(session: Session, run: Run, energy_j: FloatArray) -> Measures:
     error_m = np.linalg.norm(run.local["position_m"] - run.remote["position_m"], axis=1)
     quarter = max(1, len(error_m) // 4)
     end = slice(-min(len(time_s), round(_END_S * session.loop.rate_hz)), None)
+    derive = derivation(session)
+    pairs = (("local", run.local), ("remote", run.remote))
+    derived = {site: derive(site, rows["q"]) for site, rows in pairs}
     forces_n = (run.local["external_force_n"] + run.remote["external_force_n"])[end].mean(axis=0)
     figures: Measures = {
         "duration_s": float(time_s[-1]),
@@ -67,20 +71,21 @@ def measure(session: Session, run: Run, energy_j: FloatArray) -> Measures:
         "sub_task_error_start_rad_s": float(run.remote["sub_task_error_rad_s"][0]),
         "sub_task_error_max_rad_s": float(run.remote["sub_task_error_rad_s"].max()),
         "sub_task_error_end_rad_s": float(run.remote["sub_task_error_rad_s"][end].mean()),
-        "midpoint_distance_min_m": _extreme(run.remote["midpoint_distance_m"], np.min),
-        "link_distance_min_m": _extreme(run.remote["link_distance_m"], np.min),
+        "midpoint_distance_min_m": _extreme(derived["remote"]["midpoint_distance_m"], np.min),
+        "link_distance_min_m": _extreme(derived["remote"]["link_distance_m"], np.min),
         **_null_space_leak(session, run.remote),
         **_energy(session, run, energy_j),
     }
-    for site, rows in (("local", run.local), ("remote", run.remote)):
+    for site, rows in pairs:
+        manipulability = derived[site]["manipulability"]
         figures |= {
             f"{site}_torque_max_nm": float(np.abs(rows["torque_nm"]).max()),
             f"{site}_joint_speed_max_rad_s": float(np.abs(rows["q_dot"]).max()),
             f"{site}_coupling_force_max_n": float(np.abs(rows["coupling_force_n"]).max()),
             f"{site}_age_max_s": _extreme(rows["one_way_delay_s"], np.max),
-            f"{site}_manipulability_start": float(rows["manipulability"][0]),
-            f"{site}_manipulability_end": float(rows["manipulability"][-1]),
-            f"{site}_manipulability_min": float(rows["manipulability"].min()),
+            f"{site}_manipulability_start": float(manipulability[0]),
+            f"{site}_manipulability_end": float(manipulability[-1]),
+            f"{site}_manipulability_min": float(manipulability.min()),
         }
         for axis, force in zip("xyz", rows["external_force_n"][end].mean(axis=0), strict=False):
             figures[f"{site}_external_force_end_{axis}_n"] = float(force)

@@ -6,13 +6,15 @@ from typing import Annotated
 
 import typer
 
-from farhand.console import OUT, user_errors
+from farhand.console import ERR, OUT, user_errors
 from farhand.picture import picture_of
 from farhand.recordings import Recordings, SessionFile, TakeNumber, session_of
+from hardware.interface import HardwareError
+from site_runtime.derived import derivation
 from telemetry.dashboard import save_recording
 from telemetry.export import write_csv, write_joined, write_parquet
-from telemetry.rows import TelemetryError
-from telemetry.takes import read_take
+from telemetry.rows import DERIVED, Derive, TelemetryError, nothing_derived
+from telemetry.takes import Take, read_take
 
 
 class Kind(StrEnum):
@@ -46,16 +48,33 @@ def export(
         written = [out]
         match to:
             case Kind.PARQUET:
-                written = write_parquet(out, chosen)
+                written = write_parquet(out, chosen, _derivation(chosen, files[0], session))
             case Kind.CSV:
-                written = write_csv(out, chosen)
+                written = write_csv(out, chosen, _derivation(chosen, files[0], session))
             case Kind.RESULT:
-                write_joined(out, chosen)
+                write_joined(out, chosen, _derivation(chosen, files[0], session))
             case Kind.RRD:
                 picture = picture_of(session_of(chosen, files[0], session))
                 save_recording(out, picture, chosen.arrivals())
         for path in written:
             OUT.print(f"{path}  {path.stat().st_size / 1e6:.1f} MB", soft_wrap=True, markup=False)
+
+
+def _derivation(take: Take, recording: Path, original: Path | None) -> Derive:
+    """Return what derives columns by the robots of the session, if it is to be had."""
+    try:
+        return derivation(session_of(take, recording, original))
+    except (TelemetryError, HardwareError) as error:
+        if original is not None:
+            raise
+        ERR.print(
+            f"{', '.join(DERIVED)} are left out, since the robots are not known: {error}",
+            style="yellow",
+            soft_wrap=True,
+            highlight=False,
+            markup=False,
+        )
+        return nothing_derived
 
 
 def _require_free(out: Path, to: Kind, force: bool) -> None:

@@ -1,5 +1,6 @@
 """What a session's dashboard shows."""
 
+from collections.abc import Callable
 from threading import Lock
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy.typing as npt
 from hardware.robot_model import RobotModel, RobotTerms, UrdfArm
 from remote_site.site import build_remote_controller
 from site_runtime.certification import certify
+from site_runtime.derived import derivation
 from site_runtime.energy_meter import SessionEnergyMeter, energy_meter
 from site_runtime.guard import Cut
 from site_runtime.keys import SiteId
@@ -84,8 +86,21 @@ def _site_view(session: Session, site: SiteId, colour: Colour) -> SiteView:
             return robot.chain_rows(q_rows)
 
     return SiteView(
-        site.label, colour, chain, robot.joints, robot.task_dimension, _urdf(session, site, robot)
+        site.label,
+        colour,
+        chain,
+        robot.joints,
+        robot.task_dimension,
+        _urdf(session, site, robot),
+        _clearance(session, site),
     )
+
+
+def _clearance(session: Session, site: SiteId) -> Callable[[FloatArray], FloatArray] | None:
+    if site is SiteId.LOCAL or not session.remote.obstacles:
+        return None
+    derive = derivation(session)
+    return lambda q: derive(site.label, q)["link_distance_m"]
 
 
 def _urdf(session: Session, site: SiteId, robot: RobotModel) -> UrdfView | None:

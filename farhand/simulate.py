@@ -14,8 +14,10 @@ from experiments.measures import settling_time_s
 from experiments.simulation import Run, Simulation
 from farhand.console import ERR, OUT, user_errors
 from site_runtime.daemon import SessionPath
+from site_runtime.derived import derivation
 from site_runtime.session import Session, load_session
 from telemetry.result_file import write_result
+from telemetry.rows import DerivedColumns
 
 EXIT_FAULT = 1
 
@@ -36,9 +38,9 @@ def simulate(
             raise FileNotFoundError(f"--out {out}: there is no folder {out.absolute().parent}")
         run = _simulate(loaded, duration)
         if out is not None:
-            write_result(out, run.local, run.remote, _provenance(loaded))
+            write_result(out, run.local, run.remote, _provenance(loaded), derivation(loaded))
     if len(run.local):
-        _print(run, out)
+        _print(run, derivation(loaded)("remote", run.remote["q"]), out)
     if run.failures:
         for failure in run.failures:
             ERR.print(f"FAULT {failure}", style="red", markup=False)
@@ -71,7 +73,7 @@ def _provenance(session: Session) -> dict[str, str]:
     }
 
 
-def _print(run: Run, out: Path | None) -> None:
+def _print(run: Run, remote: DerivedColumns, out: Path | None) -> None:
     time_s = run.local["time_ns"] * 1e-9
     error_m = np.linalg.norm(run.local["position_m"] - run.remote["position_m"], axis=1)
     table = Table(show_header=False)
@@ -82,13 +84,13 @@ def _print(run: Run, out: Path | None) -> None:
         settled_s = settling_time_s(time_s, error_m, limit_m)
         words = "not reached" if settled_s is None else f"{settled_s:.2f} s"
         table.add_row(f"stays below {limit_m * 1e3:g} mm after", words)
-    index = run.remote["manipulability"]
+    index = remote["manipulability"]
     table.add_row("remote det(JJᵀ)", f"{index[0]:.4f} → {index[-1]:.4f}")
-    if np.isfinite(run.remote["link_distance_m"]).any():
+    if np.isfinite(remote["link_distance_m"]).any():
         table.add_row(
             "nearest to an obstacle",
-            f"links {np.nanmin(run.remote['link_distance_m']):.4f} m, "
-            f"midpoints {np.nanmin(run.remote['midpoint_distance_m']):.4f} m",
+            f"links {np.nanmin(remote['link_distance_m']):.4f} m, "
+            f"midpoints {np.nanmin(remote['midpoint_distance_m']):.4f} m",
         )
     trips_s = run.local["round_trip_s"]
     if np.isfinite(trips_s).any():

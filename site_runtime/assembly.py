@@ -4,8 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 
-import numpy as np
-
 from channel.channel import Channel
 from channel.link import Link, TappedLink
 from hardware.interface import ContactForce, Device, DeviceConfigurationError
@@ -84,7 +82,6 @@ def assemble(
         if identity is SiteId.LOCAL
         else session.channel.local_to_remote
     )
-    obstacles = session.remote.obstacles if identity is SiteId.REMOTE else ()
     clock, start_ns = surroundings.clock, surroundings.session_start_ns
     hold_after_ns = round(session.engagement.hold_after_s * 1e9)
     robot = robot_of(session, identity)
@@ -133,7 +130,6 @@ def assemble(
             session.loop.late_ticks_to_fault,
         ),
         requests=surroundings.requests,
-        obstacles_m=tuple(np.array(obstacle.center_m) for obstacle in obstacles),
     )
 
 

@@ -1,7 +1,7 @@
 """One site: its tick, and the run that carries it."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from math import dist, nan
@@ -10,10 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from channel.channel import Channel, PeerSample
+from channel.clock_offset import OffsetEstimate
 from channel.packet import Reject
-from control_law.null_space import manipulability
-from control_law.sub_tasks.chain import center_3d
-from control_law.sub_tasks.obstacle_distance import distances
 from hardware.interface import Device, DeviceState
 from hardware.robot_model import RobotModel, RobotTerms
 from site_runtime.clock import Clock, LatenessHistogram, Pacer
@@ -36,8 +34,8 @@ from telemetry.stream import TelemetryStream
 FloatArray = npt.NDArray[np.float64]
 _FAREWELL_PACKETS = 5
 _READ, _STEP, _WRITE, _SENT = range(4)
-_NO_STAGES = (0, 0, 0, 0)
 _MOST_COUNTED = 2**32 - 1
+_NO_OFFSET = OffsetEstimate(0, -1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,6 @@ class Site:
     """Device, channel, controller, supervisor and guard of one side of the teleoperation.
 
     The same object runs in a daemon on a steady clock and in simulation on a manual one.
-    `obstacles_m` are centres (z,) each.
     """
 
     def __init__(
@@ -80,7 +77,6 @@ class Site:
         clock: Clock,
         times: SiteTimes,
         requests: OperatorRequests,
-        obstacles_m: tuple[FloatArray, ...],
     ) -> None:
         self.identity = identity
         self.channel = channel
@@ -102,12 +98,12 @@ class Site:
         self._supervisor = supervisor
         self._clock = clock
         self._times = times
-        self._obstacles_m = tuple(center_3d(centre) for centre in obstacles_m)
         self._idle = Command(np.zeros(robot.joints), np.zeros(robot.task_dimension))
         self._duration_ns = 0
         self._late_ticks = 0
         self._derated = False
         self._told_m = np.zeros(robot.task_dimension)
+        self._nowhere_m = np.full(robot.task_dimension, nan)
         self._stages_ns = [0, 0, 0, 0]
         self._rejected = [0] * len(Reject)
         self._rejected_total = 0
@@ -167,10 +163,10 @@ class Site:
             self._tick_stopped(now_ns, lateness_ns, asked)
             return
         reading: DeviceState | None = None
-        self._stages_ns[:] = _NO_STAGES
+        stages_ns = self._stages_ns = [0, 0, 0, 0]
         try:
             reading = self._device.read()
-            self._passed(_READ, now_ns)
+            stages_ns[_READ] = self._clock.now_ns() - now_ns
             asked |= CLUTCH_BUTTON if reading.clutch else 0
             self.guard.reading(reading)
             peer = self.channel.latest(now_ns)
@@ -181,14 +177,16 @@ class Site:
                 share = self._supervisor.force_share(now_ns)
                 engaged_s = self._supervisor.engaged_s(now_ns)
                 command = self.command(terms, self._supervisor.target_m, share, engaged_s)
-                self._passed(_STEP, now_ns)
+                stages_ns[_STEP] = self._clock.now_ns() - now_ns
                 self._device.write(command.torque_nm)
-                self._passed(_WRITE, now_ns)
+                stages_ns[_WRITE] = self._clock.now_ns() - now_ns
             force_n = reading.wrench[: self._robot.task_dimension]
             self._told_m = self._supervisor.told_m(terms.X)
             if self.channel.send(now_ns, state, self._told_m, terms.X_dot, force_n):
-                self._passed(_SENT, now_ns)
-            self._put(now_ns, lateness_ns, asked, reading, peer, terms, command, share, engaged_s)
+                stages_ns[_SENT] = self._clock.now_ns() - now_ns
+            self._put(
+                now_ns, lateness_ns, asked, state, peer, terms, force_n, command, share, engaged_s
+            )
         except Exception as failure:
             self._fail(now_ns, failure)
             self._put_failed(now_ns, lateness_ns, asked, reading)
@@ -257,9 +255,6 @@ class Site:
             )
         return state
 
-    def _passed(self, stage: int, start_ns: int) -> None:
-        self._stages_ns[stage] = self._clock.now_ns() - start_ns
-
     def _tick_stopped(self, now_ns: int, lateness_ns: int, asked: int) -> None:
         """Tell the peer and people that the device is stopped, and wait for a reset."""
         with suppress(Exception):  # the link may be what failed; the first failure is the one told
@@ -305,64 +300,65 @@ class Site:
         now_ns: int,
         lateness_ns: int,
         asked: int,
-        reading: DeviceState,
+        state: State,
         peer: PeerSample | None,
         terms: RobotTerms,
+        force_n: FloatArray,
         command: Command,
         share: float,
         engaged_s: float,
     ) -> None:
         """Write this tick's row."""
-        target_m = self._supervisor.target_m
-        trip_ns = None if peer is None else peer.round_trip_ns
-        self.round_trip_s = nan if trip_ns is None else trip_ns * 1e-9
-        if target_m is not None:
+        channel, supervisor, margin = self.channel, self._supervisor, self.margin
+        target_m = supervisor.target_m
+        if target_m is None:
+            target_m = self._nowhere_m
+        else:
             self._apart = (terms.X, target_m)
-        counters = self.channel.counters
-        self._count_rejected()
-        link_m, midpoint_m = self._nearest(terms)
-        offset = self.channel.offset
-        read_ns, step_ns, write_ns, sent_ns = self._stages_ns
-        self.telemetry.put(
-            stamp_ns=now_ns,
-            time_ns=now_ns - self._times.session_start_ns,
-            lateness_ns=lateness_ns,
-            duration_ns=self._duration_ns,
-            read_ns=read_ns,
-            step_ns=step_ns,
-            write_ns=write_ns,
-            sent_ns=sent_ns,
-            requests=asked,
-            state=self._supervisor.state,
-            peer_state=NO_PEER_STATE if peer is None else peer.state,
-            cut=self.guard.cut,
-            q=terms.q,
-            q_dot=terms.q_dot,
-            torque_nm=command.torque_nm,
-            position_m=terms.X,
-            velocity_m_s=terms.X_dot,
-            external_force_n=reading.wrench[: self._robot.task_dimension],
-            coupling_force_n=command.coupling_force_n,
-            peer_position_m=nan if target_m is None else target_m,
-            offset_m=self._supervisor.offset_m,
-            force_share=share,
-            engaged_s=engaged_s,
-            used_stamp_ns=0 if peer is None else peer.stamp_ns,
-            used_arrival_ns=0 if peer is None else peer.arrival_ns,
-            clock_offset_ns=0 if offset is None else offset.offset_ns,
-            clock_uncertainty_ns=-1 if offset is None else offset.uncertainty_ns,
-            one_way_delay_s=nan if peer is None else peer.age_ns * 1e-9,
-            round_trip_s=self.round_trip_s,
-            loop_bound_s=self.margin.loop_s,
-            certified_round_trip_s=self.margin.certified_s,
-            manipulability=manipulability(terms.J),
-            link_distance_m=link_m,
-            midpoint_distance_m=midpoint_m,
-            sub_task_error_rad_s=command.sub_task_error_rad_s,
-            lost=counters.lost,
-            late=counters.late,
-            rejected=self._rejected,
-            missed=self.missed,
+        if peer is None:
+            peer_state, used_stamp_ns, used_arrival_ns, delay_s = NO_PEER_STATE, 0, 0, nan
+            self.round_trip_s = nan
+        else:
+            peer_state, used_stamp_ns = peer.state, peer.stamp_ns
+            used_arrival_ns, delay_s = peer.arrival_ns, peer.age_ns * 1e-9
+            trip_ns = peer.round_trip_ns
+            self.round_trip_s = nan if trip_ns is None else trip_ns * 1e-9
+        offset_ns, uncertainty_ns = channel.offset or _NO_OFFSET
+        counters = channel.counters
+        self.telemetry.put(  # in the order of COLUMNS
+            now_ns,
+            now_ns - self._times.session_start_ns,
+            lateness_ns,
+            self._duration_ns,
+            *self._stages_ns,
+            state,
+            peer_state,
+            asked,
+            self.guard.cut,
+            terms.q,
+            terms.q_dot,
+            command.torque_nm,
+            terms.X,
+            terms.X_dot,
+            force_n,
+            command.coupling_force_n,
+            target_m,
+            supervisor.offset_m,
+            share,
+            engaged_s,
+            used_stamp_ns,
+            used_arrival_ns,
+            offset_ns,
+            uncertainty_ns,
+            delay_s,
+            self.round_trip_s,
+            margin.loop_s,
+            margin.certified_s,
+            command.sub_task_error_rad_s,
+            counters.lost,
+            counters.late,
+            self._count_rejected(counters.rejected),
+            self.missed,
         )
 
     def _put_failed(
@@ -387,21 +383,10 @@ class Site:
                 ),
             )
 
-    def _count_rejected(self) -> None:
-        rejected = self.channel.counters.rejected
-        total = rejected.total()
+    def _count_rejected(self, rejected: Mapping[Reject, int]) -> list[int]:
+        """Return the counts by reason, in the order of `Reject`; a new list only if one grew."""
+        total = sum(rejected.values())
         if total != self._rejected_total:
             self._rejected_total = total
-            self._rejected = [min(rejected[reason], _MOST_COUNTED) for reason in Reject]
-
-    def _nearest(self, terms: RobotTerms) -> tuple[float, float]:
-        """Smallest distance of links and of their midpoints to an obstacle [m], NaN without one."""
-        link_m = midpoint_m = nan
-        if self._obstacles_m:
-            points = terms.origins.tolist()
-            for centre in self._obstacles_m:
-                one_m, other_m = distances(points, centre)
-                # so written that NaN gives way
-                link_m = link_m if link_m <= one_m else one_m
-                midpoint_m = midpoint_m if midpoint_m <= other_m else other_m
-        return link_m, midpoint_m
+            self._rejected = [min(rejected.get(reason, 0), _MOST_COUNTED) for reason in Reject]
+        return self._rejected

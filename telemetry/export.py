@@ -15,8 +15,8 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
 from telemetry.recording import SESSION_FILE, Recording
-from telemetry.result_file import TIME_COLUMN, column_names, write_result
-from telemetry.rows import COLUMNS
+from telemetry.result_file import TIME_COLUMN, table_columns, write_result
+from telemetry.rows import Derive
 from telemetry.takes import SITES, Take, joined_rows
 
 WALL_COLUMN: Final = "wall_time_ns"
@@ -26,22 +26,25 @@ _SESSION_TIME: Final = "Start of the tick in session time, on one timeline for b
 _WALL_TIME: Final = "The same since 1970, by the wall clock of the site that gives the time"
 
 
-def write_parquet(folder: Path, take: Take) -> list[Path]:
+def write_parquet(folder: Path, take: Take, derive: Derive) -> list[Path]:
     """Write the tables of a take into a folder; units and meanings are the columns' metadata."""
     return _write(
         folder,
         take,
+        derive,
         ".parquet",
         lambda table, path: pq.write_table(table, path, compression="zstd", compression_level=3),
     )
 
 
-def write_csv(folder: Path, take: Take) -> list[Path]:
+def write_csv(folder: Path, take: Take, derive: Derive) -> list[Path]:
     """Write the tables of a take into a folder; units are in the columns' names: `q_1 [rad]`."""
-    return _write(folder, take, ".csv", lambda table, path: pc.write_csv(_named(table), path))
+    return _write(
+        folder, take, derive, ".csv", lambda table, path: pc.write_csv(_named(table), path)
+    )
 
 
-def write_joined(path: Path, take: Take) -> None:
+def write_joined(path: Path, take: Take, derive: Derive) -> None:
     """Write a take as a result file: a row a local tick, with the newest remote row of then."""
     local, remote = joined_rows(take)
     remote = remote.copy()
@@ -51,21 +54,19 @@ def write_joined(path: Path, take: Take) -> None:
         for run in take.runs
     }
     digest = {"session_digest": take.metadata["digest"]}
-    write_result(path, local, remote, {"session": take.session_text, **digest, **told})
+    write_result(path, local, remote, {"session": take.session_text, **digest, **told}, derive)
 
 
-def run_table(take: Take, run: Recording) -> pa.Table:
-    """Return the rows of one run, all of them, bit by bit."""
+def run_table(take: Take, run: Recording, derive: Derive) -> pa.Table:
+    """Return the rows of one run, all of them, bit by bit, and what is derived from them."""
     times_ns = take.times_ns(run)
     columns = [
         _column(TIME_COLUMN, times_ns * 1e-9, "s", _SESSION_TIME),
         _column(WALL_COLUMN, times_ns + take.zero_wall_ns, "ns", _WALL_TIME),
     ]
-    for name, column in COLUMNS.items():
-        values = run.rows[name]
-        values = values if values.ndim == 2 else values[:, np.newaxis]
-        for i, label in enumerate(column_names(name, values.shape[1])):
-            columns.append(_column(label, values[:, i], column.unit, column.meaning))
+    derived = derive(run.metadata["site"], run.rows["q"])
+    for name, values, column in table_columns(run.rows, derived):
+        columns.append(_column(name, values, column.unit, column.meaning))
     return _table(columns, run_metadata(run))
 
 
@@ -94,7 +95,11 @@ def run_metadata(run: Recording) -> dict[str, str]:
 
 
 def _write(
-    folder: Path, take: Take, suffix: str, write: Callable[[pa.Table, Path], None]
+    folder: Path,
+    take: Take,
+    derive: Derive,
+    suffix: str,
+    write: Callable[[pa.Table, Path], None],
 ) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -103,7 +108,7 @@ def _write(
         for number, run in enumerate(runs, 1):
             name = site if len(runs) == 1 else f"{site}-{number}"
             written.append(folder / f"{name}{suffix}")
-            write(run_table(take, run), written[-1])
+            write(run_table(take, run, derive), written[-1])
     written.append(folder / f"{EVENTS}{suffix}")
     write(event_table(take), written[-1])
     written.append(folder / SESSION_FILE)
@@ -114,7 +119,7 @@ def _write(
 def _column(
     name: str, values: npt.NDArray[Any], unit: str, meaning: str
 ) -> tuple[pa.Field, pa.Array]:
-    array = pa.array(np.ascontiguousarray(values))
+    array = pa.array(values)
     return pa.field(name, array.type, False, {"unit": unit, "meaning": meaning}), array
 
 

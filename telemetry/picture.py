@@ -38,6 +38,7 @@ class SiteView:
 
     `chain` turns joint angles (r, n) [rad] into the points (r, n + 1, 3) [m] of the arm, from the
     first joint's centre to the end effector; `urdf` is the body around them, if it is to be shown.
+    `clearance` tells from the angles how far the arm is from the nearest obstacle (r,) [m].
     """
 
     name: str
@@ -46,6 +47,7 @@ class SiteView:
     joints: int
     dimension: int
     urdf: UrdfView | None = None
+    clearance: Callable[[FloatArray], FloatArray] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 The columns are described in docs/result_file.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from types import MappingProxyType
@@ -16,8 +16,12 @@ import pyarrow.parquet as pq
 
 from telemetry.rows import (
     COLUMNS,
+    DERIVED,
     LAYOUT_VERSION,
     REJECT_REASONS,
+    Column,
+    Derive,
+    DerivedColumns,
     RowArray,
     TelemetryError,
 )
@@ -29,6 +33,7 @@ TIME_COLUMN: Final = "time_s"
 
 _UNIT_SUFFIX: Final = {"m": "_m", "m/s": "_m_s", "N": "_n", "N·m": "_nm"}
 _LAYOUT_KEY: Final = "layout_version"
+_DESCRIBED: Final = {**COLUMNS, **DERIVED}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +51,7 @@ def column_names(field: str, length: int) -> tuple[str, ...]:
     Numbered by joint, lettered by axis, there the unit is left to the metadata of the column; named
     by reason.
     """
-    column = COLUMNS[field]
+    column = _DESCRIBED[field]
     if column.axis == "scalar":
         return (field,)
     stem = field.removesuffix(_UNIT_SUFFIX.get(column.unit, ""))
@@ -58,16 +63,29 @@ def column_names(field: str, length: int) -> tuple[str, ...]:
     return tuple(f"{stem}_{suffix}" for suffix in suffixes[column.axis][:length])
 
 
+def table_columns(
+    rows: RowArray, derived: DerivedColumns
+) -> Iterator[tuple[str, npt.NDArray[Any], Column]]:
+    """Yield what rows (r,) are as columns of a table: name, values (r,), description."""
+    fields = {name: rows[name] for name in COLUMNS}
+    for name, values in (fields | dict(derived)).items():
+        columns = values if values.ndim == 2 else values[:, np.newaxis]
+        for i, label in enumerate(column_names(name, columns.shape[1])):
+            yield label, np.ascontiguousarray(columns[:, i]), _DESCRIBED[name]
+
+
 def write_result(
     path: str | PathLike[str] | BinaryIO,
     local_rows: RowArray,
     remote_rows: RowArray,
     metadata: Mapping[str, str],
+    derive: Derive,
 ) -> None:
     """Write the rows of both sites, which share their ticks, as one Parquet table.
 
     Equal rows and metadata give the same bytes. `metadata` is free text (the session file, versions
-    of the programs). TelemetryError if the two sites' `time_ns` differ or cannot be written.
+    of the programs); `derive` works out what rows do not hold. TelemetryError if the two sites'
+    `time_ns` differ, or if it cannot be written.
     """
     if not np.array_equal(local_rows["time_ns"], remote_rows["time_ns"]):
         raise TelemetryError(
@@ -79,14 +97,12 @@ def write_result(
     fields = [_field(TIME_COLUMN, pa.float64(), "s", COLUMNS["time_ns"].meaning)]
     arrays = [pa.array(local_rows["time_ns"] * 1e-9)]
     for site, rows in zip(SITE_NAMES, (local_rows, remote_rows), strict=True):
-        for name, column in COLUMNS.items():
+        for name, values, column in table_columns(rows, derive(site, rows["q"])):
             if name == "time_ns":
                 continue
-            values = rows[name] if rows[name].ndim == 2 else rows[name][:, np.newaxis]
-            for i, suffix in enumerate(column_names(name, values.shape[1])):
-                array = pa.array(np.ascontiguousarray(values[:, i]))
-                arrays.append(array)
-                fields.append(_field(f"{site}_{suffix}", array.type, column.unit, column.meaning))
+            array = pa.array(values)
+            arrays.append(array)
+            fields.append(_field(f"{site}_{name}", array.type, column.unit, column.meaning))
     text = {_LAYOUT_KEY: str(LAYOUT_VERSION)} | {key: metadata[key] for key in sorted(metadata)}
     table = pa.table(arrays, schema=pa.schema(fields, metadata=text))
     try:

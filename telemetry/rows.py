@@ -1,7 +1,7 @@
 """One row a tick: the one record that the stream, result files and the dashboard share."""
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 RowArray: TypeAlias = npt.NDArray[np.void]
 
-LAYOUT_VERSION: Final = 3
+LAYOUT_VERSION: Final = 4
 """Raised whenever a field of `COLUMNS` is added, removed, moved or changes its meaning."""
 
 NO_PEER_STATE: Final = 255
@@ -113,13 +113,6 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         "certified_round_trip_s": Column(
             "<f8", "scalar", "s", "Round trip the gains in use are proven stable for"
         ),
-        "manipulability": Column("<f8", "scalar", "m^(2z)", "det(J Jᵀ); zero at a singular pose"),
-        "link_distance_m": Column(
-            "<f8", "scalar", "m", "Smallest distance of the links to an obstacle; NaN: no obstacle"
-        ),
-        "midpoint_distance_m": Column(
-            "<f8", "scalar", "m", "Smallest distance of a link's midpoint to one; NaN: no obstacle"
-        ),
         "sub_task_error_rad_s": Column(
             "<f8", "scalar", "rad/s", "Norm of the sub-task error in the null space"
         ),
@@ -129,6 +122,28 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
         "missed": Column("<u4", "scalar", "1", "Ticks skipped because the loop was late, so far"),
     }
 )
+
+DERIVED: Final[Mapping[str, Column]] = MappingProxyType(
+    {
+        "manipulability": Column("<f8", "scalar", "m^(2z)", "det(J Jᵀ); zero at a singular pose"),
+        "link_distance_m": Column(
+            "<f8", "scalar", "m", "Smallest distance of the links to an obstacle; NaN: no obstacle"
+        ),
+        "midpoint_distance_m": Column(
+            "<f8", "scalar", "m", "Smallest distance of a link's midpoint to one; NaN: no obstacle"
+        ),
+    }
+)
+"""What tables for people hold besides: it follows from `q`, so no tick works it out."""
+
+DerivedColumns: TypeAlias = Mapping[str, npt.NDArray[np.float64]]
+Derive: TypeAlias = Callable[[str, npt.NDArray[np.float64]], DerivedColumns]
+"""Works out columns of `DERIVED`, (r,), from a site's name and its q (r, n)."""
+
+
+def nothing_derived(site: str, q: npt.NDArray[np.float64]) -> DerivedColumns:
+    """Derive nothing: of rows whose robot is not known."""
+    return {}
 
 
 def row_dtype(joints: int, dimension: int) -> np.dtype[np.void]:

@@ -30,6 +30,7 @@ class Signals:
         self._canvas = canvas
         self._picture = picture
         self._name = view.name
+        self._clearance = view.clearance
         self._events = EventLog(view.name, picture.state_names, picture.cut_names)
         self._state: int | None = None
         self._stated_ns = 0
@@ -74,8 +75,8 @@ class Signals:
         plot("round_trip", rows["loop_bound_s"] * 1e3)
         if self._limits:
             _plot_limits(self._canvas, times_ns, rows["certified_round_trip_s"])
-        if self._picture.scene.obstacles:
-            plot("clearance", rows["link_distance_m"] * 1e3)
+        if self._clearance is not None:
+            plot("clearance", self._clearance(rows["q"]) * 1e3)
 
     def _draw_states(self, times_ns: IntArray, rows: RowArray) -> None:
         for time_ns, state in zip(times_ns.tolist(), rows["state"].tolist(), strict=True):

@@ -15,6 +15,7 @@ from experiments import case as case_module
 from experiments.case import SETTLED_M, Case, Outcome, read_outcome, run_case
 from experiments.measures import measure
 from experiments.simulation import Simulation
+from site_runtime.derived import derivation
 from site_runtime.session import SessionError, SessionFileError
 from telemetry.rows import TelemetryError
 
@@ -195,7 +196,9 @@ def test_an_outcome_reads_back_as_it_was(short: Outcome) -> None:
     assert short.time_s == pytest.approx(np.arange(21) / 50.0)
     assert np.array_equal(short.vector("remote_q"), run.remote["q"][rows])
     assert np.array_equal(short.vector("local_position"), run.local["position_m"][rows])
-    assert np.array_equal(short.scalar("remote_manipulability"), run.remote["manipulability"][rows])
+    for site, q in (("local", run.local["q"][rows]), ("remote", run.remote["q"][rows])):
+        for name, values in derivation(session)(site, q).items():
+            assert np.array_equal(short.scalar(f"{site}_{name}"), values, equal_nan=True)
     assert np.array_equal(
         short.error_m(), run.local["position_m"][rows] - run.remote["position_m"][rows]
     )

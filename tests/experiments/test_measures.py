@@ -1,7 +1,7 @@
 """Figures of runs, against hand computation and an independent evaluation."""
 
 from dataclasses import replace
-from math import atan, cos, inf, log, nan, pi, sin
+from math import atan, cos, hypot, inf, log, nan, pi, sin
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,18 @@ TASK = Case(
     {"remote.sub_tasks[0].gain": GAIN, "remote.null_space": {"rate_limit_rad_s": inf}},
 ).session()
 LENGTH_M, MASS_KG = 0.38, 0.3
+OBSTACLE = {
+    "name": "post",
+    "center_m": [2 * LENGTH_M, -0.1],
+    "collision_radius_m": 0.01,
+    "safe_radius_m": 0.02,
+}
+POST = Case(
+    "post",
+    "theorems.toml",
+    0.3,
+    {"remote.sub_tasks": None, "remote.obstacles": [OBSTACLE]},
+).session()
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +48,7 @@ def run() -> Run:
 def rows_of(joints: int, ticks: int) -> RowArray:
     rows = np.zeros(ticks, row_dtype(joints, 2))
     rows["time_ns"] = np.arange(ticks) * 1_000_000
-    for name in ("one_way_delay_s", "round_trip_s", "midpoint_distance_m", "link_distance_m"):
+    for name in ("one_way_delay_s", "round_trip_s"):
         rows[name] = nan
     return rows
 
@@ -46,8 +58,8 @@ def made_up(ticks: int) -> Run:
     return Run(rows_of(2, ticks), rows_of(3, ticks), ())
 
 
-def figures(run: Run) -> dict[str, float]:
-    return measure(NO_TASK, run, NO_ENERGY)
+def figures(run: Run, session: Session = NO_TASK) -> dict[str, float]:
+    return measure(session, run, NO_ENERGY)
 
 
 @pytest.mark.parametrize(
@@ -120,13 +132,12 @@ def test_forces_torques_speeds_and_distances_by_hand() -> None:
     run.remote["q_dot"][9, 1] = 3.0
     run.local["coupling_force_n"][3, 1] = -6.0
     run.remote["coupling_force_n"][3, 0] = 5.0
-    for site, factor in ((run.local, 1.0), (run.remote, 2.0)):
-        site["manipulability"] = 0.5 * factor
-        site["manipulability"][[0, 500, -1]] = np.array([0.3, 0.1, 0.2]) * factor
+    run.local["q"][:, 1] = pi / 2
+    run.local["q"][[0, 500], 1] = pi / 6, 0.1
+    run.remote["q"][:] = (0.0, pi / 2, 0.0)  # from the elbow on, up
+    run.remote["q"][[0, 500]] = (0.0, 0.0, pi / 2), (0.0, 0.0, 0.1)
     run.remote["sub_task_error_rad_s"] = 1.0
     run.remote["sub_task_error_rad_s"][[0, 400]] = 2.0, 8.0
-    run.remote["midpoint_distance_m"][[3, 600]] = 0.4, 0.3
-    run.remote["link_distance_m"][3] = 0.2
     run.local["round_trip_s"][[3, 600]] = 0.1, 0.25
     run.local["one_way_delay_s"][3] = 0.1
     run.remote["one_way_delay_s"][4] = 0.15
@@ -143,23 +154,23 @@ def test_forces_torques_speeds_and_distances_by_hand() -> None:
         "remote_joint_speed_max_rad_s": 3.0,
         "local_coupling_force_max_n": 6.0,
         "remote_coupling_force_max_n": 5.0,
-        "local_manipulability_start": 0.3,
-        "local_manipulability_end": 0.2,
-        "local_manipulability_min": 0.1,
-        "remote_manipulability_start": 0.6,
-        "remote_manipulability_end": 0.4,
-        "remote_manipulability_min": 0.2,
+        "local_manipulability_start": LENGTH_M**4 / 4,
+        "local_manipulability_end": LENGTH_M**4,
+        "local_manipulability_min": LENGTH_M**4 * sin(0.1) ** 2,
+        "remote_manipulability_start": 6 * LENGTH_M**4,
+        "remote_manipulability_end": 5 * LENGTH_M**4,
+        "remote_manipulability_min": 6 * LENGTH_M**4 * sin(0.1) ** 2,
         "sub_task_error_start_rad_s": 2.0,
         "sub_task_error_max_rad_s": 8.0,
         "sub_task_error_end_rad_s": 1.0,
-        "midpoint_distance_min_m": 0.3,
-        "link_distance_min_m": 0.2,
+        "midpoint_distance_min_m": hypot(LENGTH_M / 2, 0.1),
+        "link_distance_min_m": 0.1,
         "round_trip_max_s": 0.25,
         "local_age_max_s": 0.1,
         "remote_age_max_s": 0.15,
         "certified_round_trip_s": 0.6,
     }
-    found = figures(run)
+    found = figures(run, POST)
     assert {name: found[name] for name in expected} == pytest.approx(expected)
 
 

@@ -63,6 +63,7 @@ def test_simulate_tells_and_keeps_what_happened(tmp_path: Path) -> None:
     result = farhand("simulate", DEMO, "--duration", "1.5", "--out", out)
     assert "position error" in result.output
     assert "det(JJᵀ)" in result.output
+    assert "nearest to an obstacle" in result.output
     run = read_result(out)
     assert run.time_s[0] == 0.0
     assert run.time_s[-1] == pytest.approx(1.5)

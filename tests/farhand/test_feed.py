@@ -50,7 +50,7 @@ def batch_of(session: Session) -> bytes:
         offset_m=zeros, force_share=0.0, engaged_s=0.0, used_stamp_ns=0, used_arrival_ns=0,
         clock_offset_ns=0, clock_uncertainty_ns=-1,
         one_way_delay_s=0.0, round_trip_s=0.0, loop_bound_s=0.0, certified_round_trip_s=0.3,
-        manipulability=0.0, link_distance_m=0.0, midpoint_distance_m=0.0, sub_task_error_rad_s=0.0,
+        sub_task_error_rad_s=0.0,
         lost=0, late=0, rejected=12 * [0], missed=0,
     )  # fmt: skip
     stream.drain()

@@ -26,10 +26,11 @@ from typer.testing import CliRunner, Result
 from experiments.simulation import Run, Simulation
 from farhand import replay
 from farhand.__main__ import app
+from site_runtime.derived import derivation
 from site_runtime.session import Session, load_session
 from telemetry.result_file import column_names, read_result
 from telemetry.row_ring import SiteEvent
-from telemetry.rows import COLUMNS, RowArray
+from telemetry.rows import COLUMNS, DERIVED, RowArray
 from telemetry.stream import Batch
 from tests.fakes import recordings
 from tests.fakes.recordings import WALL_OFFSET_NS, record
@@ -89,6 +90,8 @@ def test_parquet_has_a_table_a_site_with_every_row_and_what_explains_it(
     for site, rows, shift_ns in (("local", local_rows, 0), ("remote", demo_run.remote, 2 * MS)):
         table = pq.read_table(out / f"{site}.parquet")
         for label, values in expect_columns(rows):
+            assert table.column(label).to_numpy().tobytes() == values.tobytes(), label
+        for label, values in derivation(demo_session)(site, rows["q"]).items():
             assert table.column(label).to_numpy().tobytes() == values.tobytes(), label
         times_ns = rows["time_ns"] + shift_ns
         assert np.array_equal(table.column("time_s").to_numpy(), times_ns * 1e-9)
@@ -153,6 +156,8 @@ def test_a_result_has_the_local_ticks_with_the_newest_remote_rows(
     assert np.array_equal(result.columns["local_q_1"], local["q"][:, 0])
     assert np.array_equal(result.columns["remote_q_1"], remote["q"][:, 0])
     assert np.array_equal(result.columns["remote_sequence"], remote["sequence"])
+    for name, values in derivation(demo_session)("remote", remote["q"]).items():
+        assert np.array_equal(result.columns[f"remote_{name}"], values)
     assert np.array_equal(result.time_s, local["time_ns"] * 1e-9)
     assert result.metadata["session"] == demo_session.text
     assert json.loads(result.metadata["local_run"])["gaps"] == json.dumps([missing(demo_run)])
@@ -292,6 +297,34 @@ def test_a_urdf_that_is_not_in_it_is_found_beside_or_through_the_original(
     changed = to_rrd(path)
     assert changed.exit_code == 0
     assert "may differ" in changed.output
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv"])
+def test_tables_without_the_robot_have_what_was_recorded_and_say_what_is_left_out(
+    seven_dof_run: tuple[Session, RowArray],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+) -> None:
+    session, rows = seven_dof_run
+    monkeypatch.setattr(recordings, "named_files", lambda _: {})
+    path = record(tmp_path / "rows-a-local.mcap", "local", rows, session)
+
+    def names(out: Path, *more: str | Path) -> tuple[set[str], str]:
+        result = farhand("export", path, "--to", kind, "--out", out, *more)
+        assert result.exit_code == 0
+        table = (pq.read_table if kind == "parquet" else pc.read_csv)(out / f"local.{kind}")
+        return {name.split(" [")[0] for name in table.column_names}, result.output
+
+    bare, told = names(tmp_path / "bare")
+    assert "are left out" in told
+    assert all(name in told for name in DERIVED)
+    assert {label for label, _ in expect_columns(rows)} < bare
+    whole, told = names(tmp_path / "whole", "--session", SEVEN_DOF)
+    assert "left out" not in told
+    assert whole - bare == set(DERIVED)
+    wrong = ("--session", DEMO, "--out", tmp_path / "wrong")
+    assert farhand("export", path, "--to", kind, *wrong).exit_code == 2
 
 
 def test_another_session_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ def test_the_site_is_built_as_the_session_file_says() -> None:
     assert tuple(controller.damping.task) == session.local.damping.task_n_s_per_m
     assert tuple(controller.coupling.stiffness) == session.coupling.stiffness_n_per_m
     assert isinstance(site._device._contact, HumanArm)
-    assert site._obstacles_m == ()
 
 
 def test_a_force_sensor_of_the_session_joins_the_device() -> None:

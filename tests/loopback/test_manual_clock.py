@@ -20,6 +20,7 @@ from channel.delay import (
 from channel.memory_link import MemoryLink, memory_links
 from channel.packet import Reject
 from experiments.simulation import Run, Simulation
+from site_runtime.derived import derivation
 from site_runtime.keys import SiteId
 from site_runtime.session import (
     ChannelSettings,
@@ -314,7 +315,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(
     runs = []
     for file, seed in zip(files, (1, 1, 2), strict=True):
         run = Simulation(replace(session, seed=seed)).run(0.4)
-        write_result(file, run.local, run.remote, {"session": session.text})
+        write_result(file, run.local, run.remote, {"session": session.text}, derivation(session))
         runs.append(run)
     one, two, other = runs
     assert one.local.tobytes() == two.local.tobytes()

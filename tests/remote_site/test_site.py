@@ -28,6 +28,3 @@ def test_the_site_is_built_as_the_session_file_says() -> None:
     walls = site._device._contact
     assert isinstance(walls, Walls)
     assert len(walls.walls) == len(session.remote.environment.walls)
-    assert [(x, y) for x, y, _ in site._obstacles_m] == [
-        obstacle.center_m for obstacle in session.remote.obstacles
-    ]

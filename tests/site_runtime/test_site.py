@@ -152,9 +152,9 @@ class NotedTelemetry(TelemetryStream):
     def event(self, stamp_ns: int, text: str) -> None:
         self.events.append((stamp_ns, text))
 
-    def put(self, **fields: object) -> None:
+    def put(self, *fields: object) -> None:
         self.journal.note("put")
-        super().put(**fields)  # type: ignore[arg-type]
+        super().put(*fields)  # type: ignore[arg-type]
 
 
 class Bench:
@@ -212,7 +212,6 @@ class Bench:
             clock=self.clock,
             times=SiteTimes(MS, send_every * MS, 3 * MS, LATE_HOLD, LATE_FAULT),
             requests=self.requests,
-            obstacles_m=(np.array([0.0, 0.5]),),
         )
         self.site.open()
 
@@ -328,6 +327,8 @@ def test_the_point_and_the_torque_are_guarded(bench: Bench) -> None:
 
 def test_the_row_tells_what_was_done(bench: Bench) -> None:
     bench.engage()
+    channel = bench.site.channel
+    channel.counters.lost += 5
     bench.tick()
     row, terms = bench.row(), bench.model.terms(Q, bench.device.velocity)
     assert row["stamp_ns"] == bench.clock.now_ns()
@@ -343,13 +344,17 @@ def test_the_row_tells_what_was_done(bench: Bench) -> None:
     assert row["external_force_n"].tolist() == [1.0, 2.0]
     assert np.allclose(row["coupling_force_n"], bench.peer_position - terms.X)
     assert np.array_equal(row["peer_position_m"], bench.peer_position)
-    assert row["sub_task_error_rad_s"] == 0.25
-    assert row["manipulability"] == pytest.approx(np.linalg.det(terms.J @ terms.J.T))
-    middles = 0.5 * (terms.origins[1:, :2] + terms.origins[:-1, :2])
-    assert row["midpoint_distance_m"] == pytest.approx(
-        np.linalg.norm(middles - [0.0, 0.5], axis=1).min()
+    assert (row["force_share"], row["engaged_s"]) == (
+        bench.controller.shares[-1],
+        bench.controller.asked[-1][1],
     )
-    assert row["link_distance_m"] <= row["midpoint_distance_m"]
+    assert row["sub_task_error_rad_s"] == 0.25
+    offset = channel.offset
+    assert offset is not None
+    assert (row["clock_offset_ns"], row["clock_uncertainty_ns"]) == offset
+    assert offset.uncertainty_ns > 0
+    assert row["loop_bound_s"] == bench.site.margin.loop_s
+    assert (row["lost"], row["late"], row["missed"]) == (5, 0, 0)
     assert row["certified_round_trip_s"] == CERTIFIED_S
     assert row["round_trip_s"] == pytest.approx(1e-3)  # sent, used at the peer's next tick, back
     assert bench.site.error_m == pytest.approx(np.linalg.norm(bench.peer_position - terms.X))

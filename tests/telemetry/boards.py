@@ -76,15 +76,21 @@ class Meter:
         return EnergyTrace(times_ns[every], functional, injected, dissipated)
 
 
+def first_angle(q: FloatArray) -> FloatArray:
+    """Stand in for the clearance: what is easily checked of angles."""
+    return q[:, 0]
+
+
 def picture_of(
     chain: Chain,
     dimension: int = 2,
     scene: Scene = SCENE,
     urdfs: tuple[UrdfView | None, UrdfView | None] = (None, None),
 ) -> Picture:
+    clearance = first_angle if scene.obstacles else None
     sites = (
-        SiteView("local", LOCAL_COLOUR, chain, 2, dimension, urdfs[0]),
-        SiteView("remote", REMOTE_COLOUR, chain, 3, dimension, urdfs[1]),
+        SiteView("local", LOCAL_COLOUR, chain, 2, dimension, urdfs[0], clearance),
+        SiteView("remote", REMOTE_COLOUR, chain, 3, dimension, urdfs[1], clearance),
     )
     return Picture(sites, scene, STATES, {1: "torque"}, certificate=CERTIFICATE, meter=Meter)
 

@@ -102,9 +102,6 @@ def make_run(seconds: float = 12.0, dimension: int = 2, seed: int = 3) -> Run:
         row["loop_bound_s"] = row["round_trip_s"] + 0.03
         row["certified_round_trip_s"] = 0.4
         row["clock_uncertainty_ns"] = -1
-        row["manipulability"] = 0.1
-        row["link_distance_m"] = np.linalg.norm(x - (0.25, -0.1), axis=1) - 0.02
-        row["midpoint_distance_m"] = row["link_distance_m"] + 0.01
         row["missed"] = np.where(t > 4.2, 3, 0)
         row["rejected"][:, 4] = np.where(t > 8.3, 2, 0)
         rows[site] = row

@@ -16,7 +16,7 @@ from telemetry.companion import SharedMemory
 from telemetry.recorder import Recorder, RecorderOptions
 from telemetry.recorder_process import RecorderProcess
 from telemetry.recording import Recording, read_recording
-from telemetry.row_ring import SiteEvent
+from telemetry.row_ring import ARRIVAL, SiteEvent
 from telemetry.rows import COLUMNS, TelemetryError, row_dtype
 from telemetry.stream import TelemetryStream
 
@@ -211,7 +211,8 @@ def test_a_full_disk_loses_nothing_while_there_is_room_in_memory(
 def test_a_disk_full_for_long_costs_the_oldest_rows_which_are_counted_and_located(
     tmp_path: Path, stream: TelemetryStream, disk: Disk
 ) -> None:
-    recorder = Recorder(stream.ring, options(tmp_path, backlog_bytes=100 * ROW_BYTES))
+    room = 50 * (ROW_BYTES + 2 * ARRIVAL.itemsize)
+    recorder = Recorder(stream.ring, options(tmp_path, backlog_bytes=room))
     recorder.start()
     put(stream, 50)
     recorder.drain()

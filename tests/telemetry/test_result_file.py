@@ -2,13 +2,15 @@ import re
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow.parquet as pq
 import pytest
 
 from telemetry.result_file import SITE_NAMES, column_names, read_result, write_result
-from telemetry.rows import COLUMNS, RowArray, TelemetryError, row_dtype
+from telemetry.rows import COLUMNS, DERIVED, RowArray, TelemetryError, nothing_derived, row_dtype
 
 PAGE = Path(__file__).parents[2] / "docs" / "result_file.md"
+FloatArray = npt.NDArray[np.float64]
 Sites = tuple[RowArray, RowArray]
 
 METADATA = {"session": "[local]\nrobot = '2R'\n", "farhand": "0.1.0", "Ω": "200 N/m"}
@@ -28,13 +30,18 @@ def rows_of(joints: int, dimension: int, count: int = 200, seed: int = 1) -> Row
     return rows
 
 
+def derive(site: str, q: FloatArray) -> dict[str, FloatArray]:
+    """Stand in for what robots and obstacles would tell: of angles, what is easily checked."""
+    return {name: q[:, place % q.shape[1]] + len(site) for place, name in enumerate(DERIVED)}
+
+
 @pytest.fixture
 def sites() -> Sites:
     return rows_of(2, 2, seed=1), rows_of(3, 2, seed=2)
 
 
 def test_what_is_written_reads_back_bit_for_bit(tmp_path: Path, sites: Sites) -> None:
-    write_result(tmp_path / "run.parquet", *sites, METADATA)
+    write_result(tmp_path / "run.parquet", *sites, METADATA, derive)
     result = read_result(tmp_path / "run.parquet")
     assert result.metadata == METADATA
     assert np.array_equal(result.time_s, np.arange(200) * 1_000_000 * 1e-9)
@@ -44,6 +51,8 @@ def test_what_is_written_reads_back_bit_for_bit(tmp_path: Path, sites: Sites) ->
             values = rows[field].reshape(len(rows), -1)
             for name, column in zip(column_names(field, values.shape[1]), values.T, strict=True):
                 expected[f"{site}_{name}"] = column
+        for name, values in derive(site, rows["q"]).items():
+            expected[f"{site}_{name}"] = values
     del expected["local_time_ns"], expected["remote_time_ns"]
     assert list(result.columns) == list(expected)
     for name, column in expected.items():
@@ -55,19 +64,19 @@ def test_what_is_written_reads_back_bit_for_bit(tmp_path: Path, sites: Sites) ->
 
 
 def test_equal_runs_give_equal_bytes(tmp_path: Path, sites: Sites) -> None:
-    write_result(tmp_path / "a.parquet", *sites, METADATA)
+    write_result(tmp_path / "a.parquet", *sites, METADATA, derive)
     reordered = dict(reversed(METADATA.items()))
-    write_result(tmp_path / "b.parquet", *(rows.copy() for rows in sites), reordered)
+    write_result(tmp_path / "b.parquet", *(rows.copy() for rows in sites), reordered, derive)
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     sites[0]["q"][7, 1] += 1e-15
-    write_result(tmp_path / "c.parquet", *sites, METADATA)
+    write_result(tmp_path / "c.parquet", *sites, METADATA, derive)
     assert (tmp_path / "a.parquet").read_bytes() != (tmp_path / "c.parquet").read_bytes()
 
 
 def test_a_run_without_rows_reads_back_without_rows(tmp_path: Path, sites: Sites) -> None:
     local, remote = (rows[:0] for rows in sites)
-    write_result(tmp_path / "empty.parquet", local, remote, METADATA)
-    write_result(tmp_path / "run.parquet", *sites, METADATA)
+    write_result(tmp_path / "empty.parquet", local, remote, METADATA, derive)
+    write_result(tmp_path / "run.parquet", *sites, METADATA, derive)
     empty, full = (read_result(tmp_path / f"{name}.parquet") for name in ("empty", "run"))
     assert empty.time_s.shape == (0,)
     assert empty.metadata == METADATA
@@ -75,34 +84,42 @@ def test_a_run_without_rows_reads_back_without_rows(tmp_path: Path, sites: Sites
 
 
 def test_columns_say_their_unit_and_meaning(tmp_path: Path, sites: Sites) -> None:
-    write_result(tmp_path / "run.parquet", *sites, METADATA)
+    write_result(tmp_path / "run.parquet", *sites, METADATA, derive)
     schema = pq.read_schema(tmp_path / "run.parquet")
     assert schema.field("time_s").metadata[b"unit"] == b"s"
     for name in ("q_dot", "torque_nm", "position_m", "manipulability"):
-        column = COLUMNS[name]
+        column = (COLUMNS | DERIVED)[name]
         for suffix in column_names(name, 2):
             metadata = schema.field(f"local_{suffix}").metadata
             assert metadata[b"unit"].decode() == column.unit
             assert metadata[b"meaning"].decode() == column.meaning
 
 
+def test_what_cannot_be_derived_is_left_out(tmp_path: Path, sites: Sites) -> None:
+    write_result(tmp_path / "run.parquet", *sites, METADATA, nothing_derived)
+    write_result(tmp_path / "all.parquet", *sites, METADATA, derive)
+    columns, whole = (read_result(tmp_path / f"{name}.parquet").columns for name in ("run", "all"))
+    missing = {f"{site}_{name}" for site in SITE_NAMES for name in DERIVED}
+    assert set(whole) - set(columns) == missing
+
+
 def test_sites_that_do_not_share_their_ticks_are_refused(tmp_path: Path, sites: Sites) -> None:
     local, remote = sites
     with pytest.raises(TelemetryError, match="199 local and 200 remote"):
-        write_result(tmp_path / "run.parquet", local[:-1], remote, {})
+        write_result(tmp_path / "run.parquet", local[:-1], remote, {}, derive)
     remote["time_ns"][-1] += 1
     with pytest.raises(TelemetryError, match="share their ticks"):
-        write_result(tmp_path / "run.parquet", local, remote, {})
+        write_result(tmp_path / "run.parquet", local, remote, {}, derive)
 
 
 def test_the_files_own_metadata_key_is_reserved(tmp_path: Path, sites: Sites) -> None:
     with pytest.raises(TelemetryError, match="layout_version"):
-        write_result(tmp_path / "run.parquet", *sites, {"layout_version": "7"})
+        write_result(tmp_path / "run.parquet", *sites, {"layout_version": "7"}, derive)
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, sites: Sites) -> None:
     with pytest.raises(TelemetryError, match="nowhere"):
-        write_result(tmp_path / "nowhere" / "run.parquet", *sites, {})
+        write_result(tmp_path / "nowhere" / "run.parquet", *sites, {}, derive)
 
 
 def test_what_is_no_result_is_refused(tmp_path: Path, sites: Sites) -> None:
@@ -111,7 +128,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path, sites: Sites) -> None:
     (tmp_path / "noise.parquet").write_bytes(b"PAR1 and then nothing of the kind")
     with pytest.raises(TelemetryError, match="cannot read"):
         read_result(tmp_path / "noise.parquet")
-    write_result(tmp_path / "run.parquet", *sites, {})
+    write_result(tmp_path / "run.parquet", *sites, {}, derive)
     table = pq.read_table(tmp_path / "run.parquet").replace_schema_metadata({})
     pq.write_table(table, tmp_path / "foreign.parquet")
     with pytest.raises(TelemetryError, match="layout version None"):
@@ -127,6 +144,6 @@ def test_the_page_documents_exactly_the_columns() -> None:
     lengths = {"scalar": 1, "joint": 1, "task": 3, "reason": 12}
     assert documented == {
         column_names(name, lengths[column.axis]): (column.unit, column.meaning)
-        for name, column in COLUMNS.items()
+        for name, column in (COLUMNS | DERIVED).items()
         if name != "time_ns"
     }

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from telemetry.rows import (
     COLUMNS,
     LAYOUT_VERSION,
-    NO_PEER_STATE,
     REJECT_REASONS,
     RowArray,
     TelemetryError,
@@ -76,12 +75,11 @@ def test_a_batch_reads_back_as_it_was_put(joints: int, dimension: int) -> None:
     assert_rows_are(batch.rows, range(5), joints, dimension)
 
 
-def test_without_a_peer_a_plain_nan_fills_its_position() -> None:
+def test_fields_may_be_put_by_place_in_the_order_of_the_columns() -> None:
     stream = stream_to([])
-    stream.put(**fields_of(0) | {"peer_position_m": float("nan"), "peer_state": NO_PEER_STATE})
-    [row] = stream.last(1)
-    assert np.isnan(row["peer_position_m"]).all()
-    assert row["peer_state"] == 255
+    fields = fields_of(0)
+    stream.put(*(fields[name] for name in COLUMNS if name != "sequence"))
+    assert_rows_are(stream.last(1), [0])
 
 
 @pytest.mark.parametrize("counter", ["lost", "late", "missed", "sent_ns"])
