@@ -15,10 +15,10 @@ ROOT = Path(__file__).parents[1]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGES = PYPROJECT["tool"]["importlinter"]["root_packages"]
 COMMANDS = [
-    command.callback.__name__.replace("_", "-")
+    command.name or command.callback.__name__.replace("_", "-")
     for command in app.registered_commands
     if command.callback
-]
+] + [group.typer_instance.info.name for group in app.registered_groups if group.typer_instance]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
