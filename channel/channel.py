@@ -13,6 +13,7 @@ from channel.greatest_age import GreatestAge
 from channel.injection import DelayMode, Injection
 from channel.link import Link
 from channel.packet import NO_AGE, NO_EPOCH, NO_STAMP, Packet, PacketError, Reject, decode, encode
+from channel.send_rate import SendRate
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -77,13 +78,15 @@ class Channel:
         mode: DelayMode = "off",
         seed: int = 0,
         shared_clock: bool = False,
+        slowest_send_period_ns: int | None = None,
     ) -> None:
         """Join `link`. `site` is mine, 0 or 1; `direction` and `mode` delay what comes to me.
 
         `epoch` names this run of the process and must differ from every earlier one. A silence of
         `silence_ns` is what it takes to accept a restarted peer. Session time, which the delay
         models run on, is zero at `session_start_ns` (my clock, may lie ahead). `shared_clock` says
-        that both sites stamp on one clock: the offset is then zero, not estimated.
+        that both sites stamp on one clock: the offset is then zero, not estimated. The send period
+        grows up to `slowest_send_period_ns` while packets pile up on their way; None: never.
         """
         _require_range("site", site, 0, 1)
         _require_range("session_digest", session_digest, 0, 2**64 - 1)
@@ -96,7 +99,10 @@ class Channel:
         self._session = session_digest
         self._epoch = epoch
         self._dimension = dimension
-        self._send_period_ns = send_period_ns
+        self._rate = SendRate(
+            send_period_ns,
+            send_period_ns if slowest_send_period_ns is None else slowest_send_period_ns,
+        )
         self._silence_ns = silence_ns
         self._clock_offset = ClockOffset()
         self._shared_clock = shared_clock
@@ -192,6 +198,23 @@ class Channel:
             return False
         self.counters.sent += 1
         return True
+
+    def welcome_back(self) -> None:
+        """Let runs of the peer that another has replaced come back. Real-time safe.
+
+        For where more than their epoch tells a live run from a recording: certificates, a lease.
+        """
+        self._replaced.clear()
+
+    @property
+    def send_period_ns(self) -> int:
+        """Time between two packets at present [ns]."""
+        return self._rate.period_ns
+
+    @property
+    def slowed(self) -> bool:
+        """Whether it sends less often than it may, as packets piled up."""
+        return self._rate.share < 1.0
 
     @property
     def heard_ns(self) -> int | None:
@@ -319,10 +342,12 @@ class Channel:
         self.counters.received += 1
         self._newest = packet
         self._heard_ns = now_ns
-        if packet.echo_epoch == self._epoch and not self._shared_clock:
-            self._clock_offset.update(
-                packet.echo_stamp_ns, packet.echo_arrival_ns, packet.stamp_ns, now_ns
-            )
+        if packet.echo_epoch == self._epoch:
+            self._rate.heard(now_ns, packet.echo_stamp_ns, packet.echo_arrival_ns)
+            if not self._shared_clock:
+                self._clock_offset.update(
+                    packet.echo_stamp_ns, packet.echo_arrival_ns, packet.stamp_ns, now_ns
+                )
         self._injection.put(packet, now_ns)
 
     def _forget_peer(self) -> None:
@@ -330,6 +355,7 @@ class Channel:
         self._injection.clear()
         self._clock_offset.reset()
         self._greatest_age.reset()
+        self._rate.reset()
         self._used_stamp_ns = NO_STAMP
 
     def _due(self, now_ns: int) -> bool:
@@ -340,9 +366,9 @@ class Channel:
         self._asked_ns = now_ns
         if now_ns + half_tick_ns < self._due_ns:
             return False
-        self._due_ns += self._send_period_ns
+        self._due_ns += self._rate.period_ns
         if self._due_ns <= now_ns:  # after a stall: no burst to catch up
-            self._due_ns = now_ns + self._send_period_ns
+            self._due_ns = now_ns + self._rate.period_ns
         return True
 
 

@@ -9,6 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -36,7 +37,10 @@ class ZenohSettings:
     quarter of it longer each. The tier is 0 for a node that none dials, else one more than that of
     all that dial it: who is dialled has then given a dead connection up well before it is dialled
     anew. Where both do so at once, Zenoh may merge the new connection with the dying one, which
-    leaves one direction dead for good (zenoh issue 2806). `config_file` is a Zenoh configuration of
+    leaves one direction dead for good (zenoh issue 2806). `open_timeout_ms` is how long a handshake
+    may take; over UDP nothing repeats a lost one before it is over.
+
+    `config_file` is a Zenoh configuration of
     the user's own (routers, TLS, access control), taken as it is, lease too; only endpoints given
     here override it. `configuration` is set over either, by Zenoh's paths: certificates, access
     control.
@@ -45,6 +49,7 @@ class ZenohSettings:
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_ms: int = 500
+    open_timeout_ms: int = 2000
     tier: int = 0
     config_file: str | None = None
     configuration: Mapping[str, Any] = field(default_factory=dict)
@@ -52,24 +57,51 @@ class ZenohSettings:
     def __post_init__(self) -> None:
         if self.lease_ms < 1:
             raise ValueError(f"lease_ms = {self.lease_ms} is not allowed: it must be at least 1 ms")
+        if self.open_timeout_ms < 1:
+            raise ValueError(
+                f"open_timeout_ms = {self.open_timeout_ms} is not allowed: it must be at least 1 ms"
+            )
 
 
 class ZenohLink:
     """One site's end of the link; made by `ZenohNode.link`."""
 
-    def __init__(self, session: zenoh.Session, own_key: str, peer_key: str, capacity: int) -> None:
-        self._keys = (own_key, peer_key)
+    def __init__(
+        self, session: zenoh.Session, own_key: str, peer_key: str | None, capacity: int
+    ) -> None:
+        self._own_key = own_key
+        self._peer_key = peer_key
         self._capacity = capacity
         self._closed = False
         self._present: set[str] = set()
+        self._declaring = threading.Lock()
+        self._subscriber: _RingSubscriber | None = None
+        self._presence: _RingSubscriber | None = None
         self.attach(session)
 
     def attach(self, session: zenoh.Session) -> None:
         """Declare all anew on another session; the loop may go on meanwhile."""
-        ring = zenoh.handlers.RingChannel
-        own_key, peer_key = self._keys
-        self._present.clear()
-        self._subscriber = session.declare_subscriber(peer_key, ring(self._capacity))
+        with self._declaring:
+            self._session = session
+            self._hear()
+            self._speak()
+
+    def listen_to(self, peer_key: str | None) -> None:
+        """Listen to another peer from now on, or to none; not for the loop, which may go on.
+
+        Nothing of the one before arrives once this returns. What cannot be declared, since the node
+        is just opened anew, is declared as soon as it is.
+        """
+        with self._declaring:
+            self._peer_key = peer_key
+            before = [self._subscriber, self._presence]
+            self._subscriber = self._presence = None
+            _bounded(*(one.undeclare for one in before if one is not None))
+            with suppress(zenoh.ZError):
+                self._hear()
+
+    def _speak(self) -> None:
+        session, own_key = self._session, self._own_key
         self._publisher = session.declare_publisher(
             own_key,
             congestion_control=zenoh.CongestionControl.DROP,
@@ -77,12 +109,18 @@ class ZenohLink:
             express=True,
             reliability=zenoh.Reliability.BEST_EFFORT,
         )
-        liveliness = session.liveliness()
         # one token a run: the end of a killed one, noticed late, must not hide its successor
-        self._presence = liveliness.declare_subscriber(
-            f"{peer_key}/{_PRESENCE}/*", ring(64), history=True
+        self._token = session.liveliness().declare_token(f"{own_key}/{_PRESENCE}/{session.zid()}")
+
+    def _hear(self) -> None:
+        self._present.clear()
+        if self._peer_key is None:
+            return
+        session, ring = self._session, zenoh.handlers.RingChannel
+        self._subscriber = session.declare_subscriber(self._peer_key, ring(self._capacity))
+        self._presence = session.liveliness().declare_subscriber(
+            f"{self._peer_key}/{_PRESENCE}/*", ring(64), history=True
         )
-        self._token = liveliness.declare_token(f"{own_key}/{_PRESENCE}/{session.zid()}")
 
     def send(self, data: bytes) -> bool:
         """Publish `data`, dropping it rather than waiting; False once closed.
@@ -99,13 +137,17 @@ class ZenohLink:
 
     def receive(self) -> list[bytes]:
         """Return what the ring holds, oldest first, and empty it."""
-        return [] if self._closed else [s.payload.to_bytes() for s in _drain(self._subscriber)]
+        subscriber = self._subscriber
+        if self._closed or subscriber is None:
+            return []
+        return [sample.payload.to_bytes() for sample in _drain(subscriber)]
 
     def peer_present(self) -> bool:
         """Whether a peer has announced itself and not gone; a cut shows after its lease."""
-        if self._closed:
+        presence = self._presence
+        if self._closed or presence is None:
             return False
-        for sample in _drain(self._presence):
+        for sample in _drain(presence):
             run = str(sample.key_expr)
             if sample.kind == zenoh.SampleKind.PUT:
                 self._present.add(run)
@@ -118,11 +160,11 @@ class ZenohLink:
         if self._closed:
             return
         self._closed = True
+        hearing = [one for one in (self._presence, self._subscriber) if one is not None]
         _bounded(
             self._token.undeclare,
-            self._presence.undeclare,
             self._publisher.undeclare,
-            self._subscriber.undeclare,
+            *(one.undeclare for one in hearing),
         )
 
 
@@ -203,8 +245,8 @@ class ZenohNode:
         except zenoh.ZError as error:
             raise LinkError(_advice(settings, error)) from error
 
-    def link(self, own_key: str, peer_key: str, capacity: int = 64) -> ZenohLink:
-        """Return a link that publishes on `own_key` and listens to `peer_key`.
+    def link(self, own_key: str, peer_key: str | None, capacity: int = 64) -> ZenohLink:
+        """Return a link that publishes on `own_key` and listens to `peer_key`, or to nobody.
 
         Its ring keeps the newest `capacity` datagrams. More would outlast a longer stall, but the
         tick that ends it must take them all in, some 13 µs each.
@@ -331,8 +373,8 @@ def _values(settings: ZenohSettings) -> dict[str, Any]:
             "open/return_conditions/connect_scouted": False,
             "timestamping/enabled": False,
             "transport/shared_memory/enabled": False,
-            "transport/unicast/open_timeout": 2000,
-            "transport/unicast/accept_timeout": 2000,
+            "transport/unicast/open_timeout": settings.open_timeout_ms,
+            "transport/unicast/accept_timeout": settings.open_timeout_ms,
             "transport/link/tx/lease": settings.lease_ms * (4 + settings.tier) // 4,
             "transport/link/tx/keep_alive": _KEEP_ALIVES,
             # a full queue drops at once instead of holding the loop for a millisecond; in return it

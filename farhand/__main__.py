@@ -13,6 +13,9 @@ from farhand.doctor import doctor
 from farhand.export import export
 from farhand.info import info
 from farhand.keys import keys
+from farhand.lease import lease
+from farhand.link_test import link_test
+from farhand.list import list_robots
 from farhand.plot import plot
 from farhand.recompute import recompute
 from farhand.record import record
@@ -44,6 +47,7 @@ for command in (
     plot,
     export,
     certify,
+    link_test,
     design,
     reproduce,
     bench,
@@ -53,7 +57,9 @@ for command in (
     commission_quanser,
 ):
     app.command()(command)
+app.command("list")(list_robots)
 app.add_typer(keys)
+app.add_typer(lease)
 
 
 def main() -> None:

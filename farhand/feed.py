@@ -6,13 +6,20 @@ from collections.abc import Sequence
 from channel.zenoh_link import ZenohNode
 from site_runtime.keys import SiteId, telemetry_key
 from site_runtime.security.identity import Identity
-from site_runtime.security.network import meet_as_observer
+from site_runtime.security.network import Meeting, meet_as_observer
 from site_runtime.session import Session
 from telemetry.rows import TelemetryError
 from telemetry.stream import Batch, decode_batch
 
 DASHBOARD = "dashboard"
 _CAPACITY = 4000  # batches: well over half a minute of both sites
+
+
+def telemetry_keys(session: Session, meeting: Meeting) -> list[str]:
+    """Return where a session's rows are told: those of every operator, and of the remote site."""
+    operators = [one.person for one in meeting.people]
+    local = [telemetry_key(session.name, SiteId.LOCAL, one) for one in operators or [None]]
+    return [*local, telemetry_key(session.name, SiteId.REMOTE)]
 
 
 class Feed:
@@ -34,7 +41,7 @@ class Feed:
         self.warnings = meeting.warnings
         self._node = ZenohNode(meeting.settings)
         self._subscriptions = [
-            self._node.subscriber(telemetry_key(session.name, site), _CAPACITY) for site in SiteId
+            self._node.subscriber(key, _CAPACITY) for key in telemetry_keys(session, meeting)
         ]
         self.foreign = 0
         self.broken = 0

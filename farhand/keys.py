@@ -11,10 +11,19 @@ from typer.core import TyperGroup
 from farhand.console import OUT, user_errors
 from farhand.feed import DASHBOARD
 from site_runtime.daemon import SessionPath
+from site_runtime.keys import SiteId
 from site_runtime.security.authority import Authority, create_authority, open_authority
 from site_runtime.security.credentials import KEY_FILE, NEAR, read_credentials
 from site_runtime.security.endpoints import Endpoint
-from site_runtime.security.identity import AUTHORITY, ROUTER, SITES, Identity, Role, SecurityError
+from site_runtime.security.identity import (
+    AUTHORITY,
+    PEOPLE,
+    ROUTER,
+    SITES,
+    Identity,
+    Role,
+    SecurityError,
+)
 from site_runtime.security.network import keys_folder
 from site_runtime.session import Session, load_session
 
@@ -27,7 +36,7 @@ Hosts: TypeAlias = Annotated[
     ),
 ]
 Names: TypeAlias = Annotated[
-    list[str], typer.Argument(metavar="NAME...", help="local, remote, router, or an observer's.")
+    list[str], typer.Argument(metavar="NAME...", help="As in `show`: remote, operator.alice, …")
 ]
 
 
@@ -56,6 +65,22 @@ def make(
         list[str] | None,
         typer.Option("--observer", metavar="NAME", help="A dashboard or recorder; repeatable."),
     ] = None,
+    operator: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--operator",
+            metavar="NAME",
+            help="Who may be at the local site, one at a time; instead of `local`; repeatable.",
+        ),
+    ] = None,
+    supervisor: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--supervisor",
+            metavar="NAME",
+            help="An operator who may take the robot from another; repeatable.",
+        ),
+    ] = None,
     host: Hosts = None,
 ) -> None:
     """Make an authority, and certificates of both sites, the router and observers; keep others."""
@@ -66,14 +91,20 @@ def make(
         for one in observers:
             if one.role is not Role.OBSERVER:
                 raise SecurityError(f"{one.name} is no observer: choose another name")
-        wanted = [*SITES.values(), ROUTER, *observers]
-        hosts = _hosts(loaded, host or [], wanted)
+        people = [Identity(f"{Role.OPERATOR}.{name}") for name in operator or []]
+        people += [Identity(f"{Role.SUPERVISOR}.{name}") for name in supervisor or []]
         new = not (folder / AUTHORITY / KEY_FILE).exists()
         if new and (there := _places(folder)):
             raise SecurityError(
                 f"{folder} has keys of {', '.join(there)} but not the authority that made them: "
                 f"bring it back as {folder / AUTHORITY}, or name another folder in network.keys"
             )
+        known = () if new else open_authority(folder).identities
+        _require_one_each([*people, *known])
+        named = people or any(one.role in PEOPLE for one in known)
+        at_local = people if named else [SITES[SiteId.LOCAL]]
+        wanted = [*at_local, SITES[SiteId.REMOTE], ROUTER, *observers]
+        hosts = _hosts(loaded, host or [], wanted)
         authority = create_authority(folder, loaded.name) if new else open_authority(folder)
         allowed = authority.allowed
         for identity in wanted:
@@ -169,6 +200,14 @@ def _known(authority: Authority, names: Iterable[str]) -> list[Identity]:
     return identities
 
 
+def _require_one_each(identities: Iterable[Identity]) -> None:
+    """Refuse a person who would be operator and supervisor: the lease knows people by name."""
+    roles: dict[str, Role] = {}
+    for one in identities:
+        if one.person is not None and roles.setdefault(one.person, one.role) is not one.role:
+            raise SecurityError(f"{one.person} is operator or supervisor, not both")
+
+
 def _hosts(
     session: Session, given: Iterable[str], identities: Iterable[Identity]
 ) -> dict[Identity, list[str]]:
@@ -181,7 +220,8 @@ def _hosts(
     }
     hosts: dict[Identity, list[str]] = {}
     for identity in identities:
-        named = [Endpoint("", text) for text in endpoints.get(identity.name, ())]
+        place = "local" if identity.role in PEOPLE else identity.name
+        named = [Endpoint("", text) for text in endpoints.get(place, ())]
         hosts[identity] = [one.host for one in named if not one.unspecified]
     for text in given:
         name, separator, host = text.partition("=")

@@ -47,9 +47,14 @@ def router(
                 + (meeting.credentials.common_name if meeting.credentials else "no certificates")
             )
             # not the telemetry, which else would be sent here when nobody looks
+            operators = [one.person for one in meeting.people] or [None]
+            parties = [*((SiteId.LOCAL, one) for one in operators), (SiteId.REMOTE, None)]
             heard = [
-                _Rate(site, node.subscriber(state_key(loaded.name, site), _CAPACITY))
-                for site in SiteId
+                _Rate(
+                    person or site.label,
+                    node.subscriber(state_key(loaded.name, site, person), _CAPACITY),
+                )
+                for site, person in parties
             ]
             _watch(node, heard, signals)
 
@@ -57,8 +62,8 @@ def router(
 class _Rate:
     """How many packets a site has sent through since the last status line."""
 
-    def __init__(self, site: SiteId, subscription: Subscription) -> None:
-        self._site = site
+    def __init__(self, name: str, subscription: Subscription) -> None:
+        self._name = name
         self._subscription = subscription
         self._count = 0
 
@@ -68,7 +73,7 @@ class _Rate:
     def text(self, over_s: float) -> str:
         """Return the rate, and count anew."""
         rate_hz, self._count = self._count / over_s, 0
-        return f"{self._site.label} {rate_hz:.0f} packets/s"
+        return f"{self._name} {rate_hz:.0f} packets/s"
 
 
 def _watch(node: ZenohNode, heard: Sequence[_Rate], signals: StopSignals) -> None:

@@ -9,6 +9,7 @@ from channel.link import Link, TappedLink
 from hardware.interface import ContactForce, Device, DeviceConfigurationError
 from hardware.registry import DeviceContext, driver, force_sensor
 from hardware.sensed import SensedDevice
+from site_runtime.certification import slowest_send_period_ns
 from site_runtime.clock import Clock
 from site_runtime.controller import Controller
 from site_runtime.guard import Guard
@@ -113,6 +114,7 @@ def assemble(
             mode=session.channel.injection,
             seed=session.seed,
             shared_clock=surroundings.shared_clock,
+            slowest_send_period_ns=slowest_send_period_ns(session),
         ),
         controller=controller,
         supervisor=Supervisor(engagement_rules(session, identity, start_ns), z),

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
 
 from control_law import sampling
 from control_law.certificates import (
@@ -17,6 +18,9 @@ from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of, damping_of, robot_of
 from site_runtime.pose_search import PoseSearch
 from site_runtime.session import Session
+
+SPACING_SHARE: Final = 0.25
+"""Of the certified round trip that the spacing of both sites' packets may take when it adapts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +124,32 @@ def site_gains(session: Session, site: SiteId) -> SiteGains:
     return SiteGains(damping, robot_of(session, site).reach_m)
 
 
+def certified_round_trip_s(session: Session) -> float:
+    """Return the longest round trip that the gains are proven for, by Theorems A and B [s]."""
+    local, remote = (site_gains(session, site) for site in SiteId)
+    return best(coupling_of(session.coupling), local, remote, hold_of(session)).round_trip_s
+
+
+def slowest_send_period_ns(session: Session) -> int:
+    """Return the time between two packets beyond which adapting never goes [ns], whole ticks.
+
+    The spacing of both sites is part of the round trip: together they take a quarter of what is
+    certified at most. And a third of the silence that leads to HOLD, as the session check asks.
+    """
+    if not session.channel.adapt_send_rate:
+        return session.send_period_ns
+    most_s = min(
+        certified_round_trip_s(session) * SPACING_SHARE / 2.0,
+        session.engagement.hold_after_s / 3.0,
+    )
+    ticks = int(most_s * 1e9) // session.period_ns
+    return max(session.send_period_ns, ticks * session.period_ns)
+
+
 def injected_round_trip_s(session: Session) -> float:
-    """Return both directions' bounds, packet spacing and a tick a side [s]."""
+    """Return both directions' bounds, packet spacing at its slowest and a tick a side [s]."""
     channel = session.channel
-    injected_s = 2.0 * (session.send_period_ns + session.period_ns) * 1e-9
+    injected_s = 2.0 * (slowest_send_period_ns(session) + session.period_ns) * 1e-9
     if channel.injection != "off":
         injected_s += channel.local_to_remote.bound_s + channel.remote_to_local.bound_s
     return injected_s

@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Callable
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -13,18 +13,20 @@ import typer
 from rich.console import Console
 
 from channel.link import LinkError
-from channel.zenoh_link import ZenohNode
+from channel.zenoh_link import ZenohLink, ZenohNode
 from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
 from site_runtime.clock import SteadyClock
 from site_runtime.daemon_log import DaemonLog, LogFormat
 from site_runtime.flight_recorder import start_recorder
-from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
+from site_runtime.lease_claimant import LeaseClaimant
+from site_runtime.lease_keeper import LeaseKeeper, rules_of
 from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
-from site_runtime.security.network import meet_as_site
+from site_runtime.security.network import Meeting, meet_as_site
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
 from site_runtime.site_events import Companion, SiteEvents
@@ -45,6 +47,14 @@ Listen: TypeAlias = Annotated[
     typer.Option(
         "--listen",
         help="Zenoh endpoint to listen on; loopback unless given, e.g. tcp/0.0.0.0:7447.",
+    ),
+]
+Operator: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--as",
+        metavar="NAME",
+        help="The operator at the local site, of `farhand keys`; the only one if left out.",
     ),
 ]
 Duration: TypeAlias = Annotated[
@@ -76,6 +86,8 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 EMERGENCY_STOP_SIGNAL = signal.SIGUSR1
 RESET_SIGNAL = signal.SIGUSR2
 
+_WORDS = 64  # of the lease that wait to be taken in
+
 EXIT_FAULT = 1
 EXIT_NOT_STARTED = 2
 
@@ -91,6 +103,7 @@ class DaemonOptions:
     record: bool
     metrics: MetricsAddress | None
     log: LogFormat
+    operator: str | None = None
 
 
 def site_command(
@@ -107,6 +120,7 @@ def site_command(
         no_record: NoRecord = False,
         metrics: Metrics = None,
         log: Log = LogFormat.TEXT,
+        operator: Operator = None,
     ) -> None:
         options = DaemonOptions(
             None if connect is None else tuple(connect),
@@ -116,6 +130,7 @@ def site_command(
             not no_record,
             metrics,
             log,
+            operator,
         )
         raise typer.Exit(run_daemon(identity, build, session, options))
 
@@ -137,7 +152,7 @@ def run_daemon(
     log = DaemonLog(identity.label, options.log)
     try:
         session = load_session(session_path)
-        meeting = meet_as_site(session, identity, options.listen, options.connect)
+        meeting = meet_as_site(session, identity, options.listen, options.connect, options.operator)
         clock = SteadyClock()
         requests = OperatorRequests()
         shares_rows = options.record or options.metrics is not None
@@ -145,19 +160,28 @@ def run_daemon(
             closing(ZenohNode(meeting.settings)) as node,
             closing(SharedMemory()) as memory,
         ):
+            link = node.link(
+                state_key(session.name, identity, meeting.person),
+                # of several operators none is heard before one holds the lease
+                None
+                if identity is SiteId.REMOTE and meeting.people
+                else state_key(session.name, identity.peer),
+            )
+            publish = node.publisher(telemetry_key(session.name, identity, meeting.person))
+            if meeting.person is not None:
+                publish = _while_leased(requests, publish)
             surroundings = Surroundings(
-                link=node.link(
-                    state_key(session.name, identity), state_key(session.name, identity.peer)
-                ),
+                link=link,
                 clock=clock,
                 session_start_ns=clock.now_ns(),
                 epoch=time.time_ns(),
-                publish=node.publisher(telemetry_key(session.name, identity)),
+                publish=publish,
                 requests=requests,
                 allocate=memory.allocate if shares_rows else bytearray,
             )
             log.about(session.name, surroundings.epoch)
             site = build(session, surroundings)
+            lease = _lease(meeting, session, site, surroundings, node, link)
             log.say(_greeting(session, site))
             for warning in meeting.warnings:
                 log.say(f"network: {warning}", "WARN")
@@ -175,7 +199,8 @@ def run_daemon(
                 start_recorder(session, site, memory)
                 if options.record
                 else nullcontext() as recorder,
-                _status(site, (recorder, metrics), log, options),
+                _status(site, (recorder, metrics), _shown(lease), log, options),
+                lease,
                 LinkKeeper(site.channel, node, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
@@ -199,19 +224,72 @@ def run_daemon(
     return EXIT_FAULT if site.failure is not None else 0
 
 
+def _lease(
+    meeting: Meeting,
+    session: Session,
+    site: Site,
+    surroundings: Surroundings,
+    node: ZenohNode,
+    link: ZenohLink,
+) -> LeaseKeeper | LeaseClaimant | AbstractContextManager[None]:
+    """Return this site's side of the lease; a local site without operators has none."""
+    name, epoch = session.name, surroundings.epoch
+    if site.identity is SiteId.REMOTE:
+        persons = [one.person for one in meeting.people if one.person is not None]
+        return LeaseKeeper(
+            session,
+            site,
+            epoch,
+            surroundings.clock,
+            link,
+            {person: node.subscriber(claim_key(name, person), _WORDS) for person in persons},
+            rules_of(session, meeting.people),
+            node.publisher(lease_key(name)),
+        )
+    if meeting.person is None:
+        return nullcontext()
+    return LeaseClaimant(
+        meeting.person,
+        epoch,
+        site,
+        node.subscriber(lease_key(name), _WORDS),
+        node.publisher(claim_key(name, meeting.person)),
+    )
+
+
+def _while_leased(
+    requests: OperatorRequests, publish: Callable[[bytes], None]
+) -> Callable[[bytes], None]:
+    """Let observers see one local site at a time: the one that holds the lease."""
+
+    def tell(data: bytes) -> None:
+        if not requests.unleased:
+            publish(data)
+
+    return tell
+
+
+def _shown(lease: object) -> tuple[Companion, ...]:
+    return (lease,) if isinstance(lease, LeaseClaimant) else ()
+
+
 def _status(
     site: Site,
     companions: tuple[Companion | None, ...],
+    shown: tuple[Companion, ...],
     log: DaemonLog,
     options: DaemonOptions,
 ) -> StatusLine:
-    """Return what tells people, or programs, how the site is while it runs."""
+    """Return what tells people, or programs, how the site is while it runs.
+
+    What is `shown` is in the status line only: it makes events of its own.
+    """
     text = log.format is LogFormat.TEXT
     running = tuple(companion for companion in companions if companion is not None)
     told = not (text and options.quiet)
     wall_offset_ns = time.time_ns() - SteadyClock().now_ns()
     events = SiteEvents(site, running, log, wall_offset_ns) if told else None
-    return StatusLine(site, running, events, live=text and not options.quiet)
+    return StatusLine(site, (*running, *shown), events, live=text and not options.quiet)
 
 
 class StopSignals:

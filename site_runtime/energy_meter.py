@@ -17,7 +17,7 @@ from control_law.coupling import Coupling
 from control_law.damping import Damping
 from control_law.lyapunov import LyapunovKrasovskii, SiteMotion
 from hardware.robot_model import RobotModel, RobotTerms
-from site_runtime.certification import certify, hold_of, site_gains
+from site_runtime.certification import certify, hold_of, site_gains, slowest_send_period_ns
 from site_runtime.keys import SiteId
 from site_runtime.parts import coupling_of, damping_of, robot_of
 from site_runtime.session import Session
@@ -189,7 +189,7 @@ def functional_rules(session: Session) -> FunctionalRules:
     """
     certification = certify(session)
     spare_s = max(certification.margin_s, 0.0) / 2.0
-    spare_s += (session.send_period_ns + session.period_ns) * 1e-9
+    spare_s += (slowest_send_period_ns(session) + session.period_ns) * 1e-9
     channel = session.channel
     windows_s = [spare_s, spare_s]
     if channel.injection != "off":

@@ -69,7 +69,8 @@ class LinkKeeper:
         elif not self._connection.dialled():
             self._well_ns = now_ns
         elif now_ns - self._well_ns >= self._patience_s * 1e9:
-            self._log.say("connected, and no answer: the connection is opened anew", "WARN")
+            if self._channel.heard_ns is not None:  # else, behind a router, it is not there yet
+                self._log.say("connected, and no answer: the connection is opened anew", "WARN")
             self._connection.reopen()
             self._patience_s = min(2.0 * self._patience_s, LONGEST_S)
             self._well_ns = self._clock.now_ns()

@@ -19,6 +19,7 @@ from channel.delay import TraceDelay
 from hardware.interface import DeviceSettings, HardwareError
 from hardware.robot_model import UrdfArm
 from site_runtime.keys import SiteId
+from site_runtime.network_profiles import fill as fill_profile
 from site_runtime.real_time import RealTimeSettings
 from site_runtime.session_checks import DIRECTIONS, contradictions
 from site_runtime.session_problems import (
@@ -163,6 +164,7 @@ def parse_session(text: str, path: Path, files: Mapping[str, Path] = NO_FILES) -
     try:
         document = tomllib.loads(text)
         _resolve_paths(document, path.resolve().parent, files)
+        fill_profile(document)
         # As JSON, strict mode takes a list for a tuple and still refuses "1" for a number.
         as_json = json.dumps(document, default=str)
     except (ValueError, RecursionError) as error:

@@ -16,6 +16,7 @@ from channel.delay import ConstantDelay, Direction
 from hardware.interface import DeviceConfigurationError, DeviceSettings
 from hardware.registry import DriverEntry, SensorEntry, driver, drivers, force_sensor, force_sensors
 from hardware.robot_model import RobotDescription
+from site_runtime.network_profiles import ProfileName
 from site_runtime.real_time import RealTimeSettings
 from site_runtime.session_problems import ABSENT, NestedProblems, Problem, explain, nearest
 
@@ -107,6 +108,7 @@ class ChannelSettings:
     send_rate_hz: Annotated[int, Field(ge=1, le=MOST_HZ)] | None = None
     local_to_remote: Direction = field(default_factory=_no_delay)
     remote_to_local: Direction = field(default_factory=_no_delay)
+    adapt_send_rate: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +118,14 @@ class NetworkSettings:
     local_listen: Locator = "tcp/127.0.0.1:7448"
     remote_listen: Locator = "tcp/127.0.0.1:7447"
     local_connect: Locator = "tcp/127.0.0.1:7447"
+    profile: ProfileName = "lan"
+    open_timeout_s: Annotated[float, Field(ge=0.1, le=60)] = 2.0
     lease_s: Annotated[float, Field(ge=0.05, le=60)] = 0.5
     zenoh_config: str | None = None
     security: Literal["none", "mtls"] = "none"
     keys: str | None = None
     router: Locator | None = None
+    operator_silence_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
     allow_plaintext: bool = False
 
 

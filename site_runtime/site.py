@@ -1,5 +1,6 @@
 """One site: its tick, and the run that carries it."""
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from site_runtime.operator_requests import (
     CLUTCH_BUTTON,
     EMERGENCY_STOP,
     RESET,
+    UNLEASED,
     OperatorRequests,
 )
 from site_runtime.supervisor import DRIVEN, STOPPED, Cause, State, Supervisor
@@ -82,6 +84,8 @@ class Site:
         self.margin = margin
         self.requests = requests
         self.telemetry = telemetry
+        self.notices: deque[str] = deque()
+        """What other threads have to tell of this site; a tick makes an event of the oldest."""
         self.lateness = LatenessHistogram()
         self.failure: Exception | None = None
         self.ticks = 0
@@ -151,6 +155,10 @@ class Site:
         """One tick. Whatever goes wrong ends in the device's stop, which never raises."""
         now_ns = self._clock.now_ns()
         asked = self.requests.take()
+        if asked & UNLEASED:
+            self.channel.welcome_back()
+        if self.notices:
+            self.telemetry.event(now_ns, self.notices.popleft())
         if self._supervisor.state in STOPPED:
             self._tick_stopped(now_ns, lateness_ns, asked)
             return
@@ -201,7 +209,7 @@ class Site:
         self._supervisor.stop()
         try:
             for packet in range(_FAREWELL_PACKETS):
-                self._say(self._clock.now_ns() + packet * self._times.send_period_ns)
+                self._say(self._clock.now_ns() + packet * self.channel.send_period_ns)
             self.telemetry.drain()
         finally:
             self._device.close()
@@ -228,6 +236,7 @@ class Site:
             late=self._late_ticks >= times.late_ticks_to_hold,
             clutch=bool(asked & (CLUTCH_BUTTON | CLUTCH)),
             emergency_stop=bool(asked & EMERGENCY_STOP),
+            unleased=bool(asked & UNLEASED),
         )
         if state is not before:
             if state in DRIVEN and before not in DRIVEN:

@@ -99,6 +99,8 @@ def describe(site: Site, rate_hz: float, *companions: Companion) -> str:
         parts.append(f"round trip {round_trip_ms:6.1f} ms")
     if not isnan(margin_ms):
         parts.append(f"margin {margin_ms:6.1f} ms")
+    if site.channel.slowed:
+        parts.append(f"sends {1e9 / site.channel.send_period_ns:.0f} Hz")
     if not isnan(site.error_m):
         parts.append(f"error {site.error_m * 1e3:6.1f} mm")
     if site.channel.peer_taken:

@@ -11,6 +11,8 @@
 | ENGAGED | HOLD | the loop is older than what `derate_to` of the gains is proven for |
 | HOLD | ENGAGED | all of that is over; a peer that engaged anew meanwhile drives, and is aligned |
 | HOLD | READY | after `stop_after`; in its last `release` nothing leads back |
+| ENGAGED | HOLD | the lease is over: the last `release` of a HOLD begins, as it does of any other |
+| RELEASED | READY | the lease is over, and `release` too |
 | ENGAGED, HOLD | RELEASED | the local operator opens the clutch |
 | RELEASED | ENGAGED, HOLD | the clutch is closed again; HOLD where HOLD would not end |
 | any but FAULT | EMERGENCY_STOP | its operator says so; in all but READY, the peer is in it |
@@ -62,6 +64,7 @@ class Cause(Enum):
 
     NO_PEER = "no live peer yet"
     NOT_YET = "the session has not started yet"
+    UNLEASED = "nobody here holds the lease"
     AGREED = "both sites agree"
     APART = "the robots' points are too far apart"
     SILENT = "the peer is silent"
@@ -163,11 +166,13 @@ class Supervisor:
         late: bool = False,
         clutch: bool = False,
         emergency_stop: bool = False,
+        unleased: bool = False,
     ) -> State:
         """Take one tick's look at peer, operator and loop; return the state this tick runs in.
 
         `own_m` is X (z,); `scale` the share of the gains that is proven at the loop's present age;
-        `late` that too many ticks in a row were; `clutch` that the operator holds it open.
+        `late` that too many ticks in a row were; `clutch` that the operator holds it open;
+        `unleased` that the operator has no right to the remote robot.
         """
         self._proven = scale
         trouble = self._trouble(now_ns, presence, peer, late)
@@ -178,6 +183,8 @@ class Supervisor:
             self._go(State.EMERGENCY_STOP, Cause.OPERATOR)
         elif self._peer_says_stop(presence):
             self._go(State.EMERGENCY_STOP, Cause.PEER_STOP)
+        elif unleased:
+            self._let_go(now_ns, own_m)
         elif self.state in _OUTPUTS_OFF:
             self._wait(now_ns, presence, peer, own_m, trouble)
         elif clutch and self.state is not State.RELEASED:
@@ -313,6 +320,25 @@ class Supervisor:
         self._go(State.HOLD, cause)
         self._held = self.target_m = point_m
         self._held_ns = now_ns
+
+    def _let_go(self, now_ns: int, own_m: FloatArray) -> None:
+        """Without a lease: lead the force away, then the outputs are off, and stay so."""
+        rules = self._rules
+        if self.state in _OUTPUTS_OFF:
+            self._go(State.READY, Cause.UNLEASED)
+            return
+        if self.state is State.RELEASED:  # what force is left goes within the same time
+            if self._gone(now_ns - self._released_ns) >= 1.0:
+                self._go(State.READY, Cause.UNLEASED)
+            return
+        if self.state is State.ENGAGED:
+            self._hold(now_ns, self.target_m, Cause.UNLEASED)
+        release_ns = round(rules.release_s * 1e9)
+        if self._left_ns(now_ns) > release_ns:
+            self._held_ns = now_ns + release_ns - rules.stop_after_ns
+            self.cause = Cause.UNLEASED
+        if self._left_ns(now_ns) <= 0:
+            self._go(State.READY, Cause.UNLEASED)
 
     def _try_to_resume(
         self,

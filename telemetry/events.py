@@ -24,7 +24,7 @@ _STATE_LEVELS: Final[Mapping[str, Level]] = {
 }
 _STOPPED: Final = ("FAULT", "EMERGENCY_STOP")
 _PEER_UNFIT: Final = ("OFFLINE", *_STOPPED)
-_CLUTCH_BUTTON, _CLUTCH, _EMERGENCY_STOP, _RESET = 1, 2, 4, 8
+_CLUTCH_BUTTON, _CLUTCH, _EMERGENCY_STOP, _RESET, _UNLEASED = 1, 2, 4, 8, 16
 _STANDSTILL_NS: Final = 20_000_000
 _COUNTERS: Final = (
     ("missed", "missed {} ticks"),
@@ -115,6 +115,8 @@ class EventLog:
             return "the peer is in emergency stop" if peer_name == name else ""
         if before in _STOPPED and asked & _RESET:
             return "its operator reset it"
+        if name in ("HOLD", "READY") and asked & _UNLEASED:
+            return "nobody here holds the lease"
         if name == "HOLD":
             return self._trouble(peer_name, row)
         return ""

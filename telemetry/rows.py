@@ -67,7 +67,7 @@ COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
             "u1",
             "scalar",
             "1",
-            "Asked for: 1 the device's clutch, 2 clutch, 4 emergency stop, 8 reset",
+            "Asked for: 1 the device's clutch, 2 clutch, 4 emergency stop, 8 reset, 16 no lease",
         ),
         "cut": Column("<u2", "scalar", "1", "Limits the guard applied in this tick, one bit each"),
         "q": Column("<f8", "joint", "rad", "Joint angles"),

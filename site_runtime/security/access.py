@@ -4,11 +4,18 @@ Everything is denied but what stands here, in both directions, by the common nam
 at the other end of each connection. Sites, router and observers each enforce it for themselves.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from site_runtime.keys import SiteId, presence_keys, state_key, telemetry_key
+from site_runtime.keys import (
+    SiteId,
+    claim_key,
+    lease_key,
+    presence_keys,
+    state_key,
+    telemetry_key,
+)
 from site_runtime.security.identity import ROUTER, SITES, Identity, Role
 
 _SAY = ("put", "liveliness_token")
@@ -23,48 +30,64 @@ class Grant:
     hears: tuple[str, ...] = ()
 
 
-def grants(session_name: str, own: Identity, routed: bool) -> Mapping[Role, Grant]:
+def grants(
+    session_name: str, own: Identity, routed: bool, people: Sequence[Identity] = ()
+) -> Mapping[Role | Identity, Grant]:
     """Return what the party `own` grants to others; who is not named gets nothing.
 
-    With `routed` all meet at the router, and each of them knows nobody else.
+    With `routed` all meet at the router, and each of them knows nobody else. With `people` they,
+    each in his own name, are in the place of the local site.
     """
+    locals_: dict[Role | Identity, Identity] = {one: one for one in people}
+    if not locals_:
+        locals_[Role.LOCAL] = SITES[SiteId.LOCAL]
+    commands = {party: _commands(session_name, one) for party, one in locals_.items()}
+    rows = {party: _rows(session_name, one) for party, one in locals_.items()}
+    remote_rows = _rows(session_name, SITES[SiteId.REMOTE])
+    answers = (*_poses(session_name, SITES[SiteId.REMOTE]), lease_key(session_name))
+    shown = (*remote_rows, lease_key(session_name))
     if own == ROUTER:
         return {
-            **{Role(site.label): _site(session_name, site) for site in SiteId},
-            Role.OBSERVER: Grant(hears=_telemetry(session_name)),
+            **{party: Grant((*commands[party], *rows[party]), answers) for party in locals_},
+            Role.REMOTE: Grant((*answers, *remote_rows), _all(commands)),
+            Role.OBSERVER: Grant(hears=(*_all(rows), *shown)),
         }
     if own.role is Role.OBSERVER:
         if routed:
-            return {Role.ROUTER: Grant(says=_telemetry(session_name))}
+            return {Role.ROUTER: Grant(says=(*_all(rows), *shown))}
         return {
-            Role(site.label): Grant(says=(telemetry_key(session_name, site),)) for site in SiteId
+            **{party: Grant(says=rows[party]) for party in locals_},
+            Role.REMOTE: Grant(says=shown),
         }
-    site = next(site for site in SiteId if SITES[site] == own)
-    peer, observer = _poses(session_name, site.peer), telemetry_key(session_name, site)
-    hears = _poses(session_name, site)
+    if own == SITES[SiteId.REMOTE]:
+        if routed:
+            return {Role.ROUTER: Grant(_all(commands), (*answers, *remote_rows))}
+        return {
+            **{party: Grant(commands[party], answers) for party in locals_},
+            Role.OBSERVER: Grant(hears=shown),
+        }
+    mine, told = _commands(session_name, own), _rows(session_name, own)
     if routed:
-        return {Role.ROUTER: Grant(says=peer, hears=(*hears, observer))}
-    return {
-        Role(site.peer.label): Grant(says=peer, hears=hears),
-        Role.OBSERVER: Grant(hears=(observer,)),
-    }
+        return {Role.ROUTER: Grant(answers, (*mine, *told))}
+    return {Role.REMOTE: Grant(answers, mine), Role.OBSERVER: Grant(hears=told)}
 
 
 def access_control(
-    granted: Mapping[Role, Grant], allowed: Mapping[Identity, str]
+    granted: Mapping[Role | Identity, Grant], allowed: Mapping[Identity, str]
 ) -> dict[str, Any]:
     """Return Zenoh's `access_control` for these grants and common names."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for role, grant in granted.items():
-        names = sorted(name for identity, name in allowed.items() if identity.role is role)
+    for party, grant in granted.items():
+        names = sorted(name for one, name in allowed.items() if party in (one, one.role))
         if not names:
             continue  # an empty list would be everybody
-        own = [{"id": f"{role}-{name}", **rule} for name, rule in _rules(grant)]
+        party_id = party.value if isinstance(party, Role) else party.name
+        own = [{"id": f"{party_id}-{name}", **rule} for name, rule in _rules(grant)]
         rules += own
-        subjects.append({"id": role.value, "cert_common_names": names})
-        policies.append({"rules": [rule["id"] for rule in own], "subjects": [role.value]})
+        subjects.append({"id": party_id, "cert_common_names": names})
+        policies.append({"rules": [rule["id"] for rule in own], "subjects": [party_id]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -93,16 +116,23 @@ def _rule(flow: str, messages: tuple[str, ...], keys: tuple[str, ...]) -> dict[s
     }
 
 
-def _site(session_name: str, site: SiteId) -> Grant:
-    return Grant(
-        says=(*_poses(session_name, site), telemetry_key(session_name, site)),
-        hears=_poses(session_name, site.peer),
-    )
+def _poses(session_name: str, one: Identity) -> tuple[str, ...]:
+    site = _site(one)
+    return state_key(session_name, site, one.person), presence_keys(session_name, site, one.person)
 
 
-def _poses(session_name: str, site: SiteId) -> tuple[str, ...]:
-    return state_key(session_name, site), presence_keys(session_name, site)
+def _commands(session_name: str, one: Identity) -> tuple[str, ...]:
+    poses = _poses(session_name, one)
+    return poses if one.person is None else (*poses, claim_key(session_name, one.person))
 
 
-def _telemetry(session_name: str) -> tuple[str, ...]:
-    return tuple(telemetry_key(session_name, site) for site in SiteId)
+def _rows(session_name: str, one: Identity) -> tuple[str, ...]:
+    return (telemetry_key(session_name, _site(one), one.person),)
+
+
+def _site(one: Identity) -> SiteId:
+    return SiteId.REMOTE if one == SITES[SiteId.REMOTE] else SiteId.LOCAL
+
+
+def _all(keys: Mapping[Role | Identity, tuple[str, ...]]) -> tuple[str, ...]:
+    return tuple(key for some in keys.values() for key in some)

@@ -8,7 +8,7 @@ from site_runtime.keys import SiteId
 from site_runtime.session_problems import SessionError
 
 _OBSERVER = "observer."
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+_NAME = re.compile(r"(?:(operator|supervisor)\.)?([a-z0-9][a-z0-9_-]{0,31})")
 _COMMON_NAME = re.compile(r"(.+)-([1-9][0-9]{0,8})")
 
 
@@ -21,6 +21,8 @@ class Role(StrEnum):
 
     LOCAL = "local"
     REMOTE = "remote"
+    OPERATOR = "operator"
+    SUPERVISOR = "supervisor"
     ROUTER = "router"
     OBSERVER = "observer"
 
@@ -35,15 +37,23 @@ class Identity:
         if not _NAME.fullmatch(self.name):
             raise SecurityError(
                 f"{self.name!r} cannot name an identity: use 1 to 32 lower-case letters, digits, "
-                "- and _, a letter or digit first"
+                "- and _, a letter or digit first; of a person at the local site, operator. or "
+                "supervisor. before it"
             )
         if self.name == AUTHORITY:
             raise SecurityError(f"{self.name!r} is the folder of the certificate authority")
 
     @property
     def role(self) -> Role:
-        """A site, the router, or else an observer."""
-        return Role(self.name) if self.name in {"local", "remote", "router"} else Role.OBSERVER
+        """A site, the router, a person at the local site, or else an observer."""
+        if self.name in {"local", "remote", "router"}:
+            return Role(self.name)
+        return Role.OBSERVER if self.person is None else Role(self.name.partition(".")[0])
+
+    @property
+    def person(self) -> str | None:
+        """The name alone of an operator or a supervisor, None for others."""
+        return self.name.partition(".")[2] or None
 
     def common_name(self, generation: int) -> str:
         """Name in its certificate, which access control goes by: `remote-2`."""
@@ -53,6 +63,8 @@ class Identity:
 
 AUTHORITY = "authority"
 """The folder of what signs certificates; no identity's name."""
+PEOPLE = (Role.OPERATOR, Role.SUPERVISOR)
+"""Who takes the place of the local site, each under a name of his own."""
 SITES = {SiteId.LOCAL: Identity("local"), SiteId.REMOTE: Identity("remote")}
 ROUTER = Identity("router")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from channel.zenoh_link import ZenohSettings
-from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
 from site_runtime.security.access import access_control, grants
 from site_runtime.security.credentials import (
     AUTHORITY_FILE,
@@ -17,11 +17,19 @@ from site_runtime.security.credentials import (
     load_credentials,
 )
 from site_runtime.security.endpoints import Endpoint, in_the_clear
-from site_runtime.security.identity import ROUTER, SITES, Identity, Role, SecurityError
+from site_runtime.security.identity import (
+    PEOPLE,
+    ROUTER,
+    SITES,
+    Identity,
+    Role,
+    SecurityError,
+)
 from site_runtime.session import Session
 
 MOST_STATE_BYTES = 512
 MOST_TELEMETRY_BYTES = 256 * 1024
+MOST_LEASE_BYTES = 16 * 1024
 BURST = 4
 """A relay lets through this many times the rate that a site has: delayed packets come in bursts."""
 
@@ -33,6 +41,13 @@ class Meeting:
     settings: ZenohSettings
     credentials: Credentials | None
     warnings: tuple[str, ...]
+    people: tuple[Identity, ...] = ()
+    """Who may be in the place of the local site; nobody in particular if empty."""
+
+    @property
+    def person(self) -> str | None:
+        """The operator's name that this party has."""
+        return None if self.credentials is None else self.credentials.identity.person
 
 
 def meet_as_site(
@@ -40,10 +55,16 @@ def meet_as_site(
     site: SiteId,
     listen: Sequence[str] | None = None,
     connect: Sequence[str] | None = None,
+    operator: str | None = None,
 ) -> Meeting:
-    """Return how a site meets its peer; None leaves the session file's word on endpoints."""
+    """Return how a site meets its peer; None leaves the session file's word on endpoints.
+
+    `operator` says who is at the local site; None is the only one whose keys are here.
+    """
     network = session.network
     local = site is SiteId.LOCAL
+    if operator is not None and not local:
+        raise SecurityError(f"--as {operator}: an operator is at the local site, not here")
     if network.router is not None:
         listens, dials = [], [Endpoint("network.router", network.router)]
     else:
@@ -52,7 +73,7 @@ def meet_as_site(
         dials = [Endpoint("network.local_connect", network.local_connect)] if local else []
     return _meet(
         session,
-        SITES[site],
+        _at_the_local_site(session, operator) if local else SITES[site],
         listens if listen is None else [Endpoint("--listen", text) for text in listen],
         dials if connect is None else [Endpoint("--connect", text) for text in connect],
     )
@@ -95,21 +116,52 @@ def keys_folder(session: Session) -> Path:
     return session.path.resolve().parent / "keys"
 
 
+def _at_the_local_site(session: Session, operator: str | None) -> Identity:
+    """Return whose certificate the local site shows."""
+    folder = keys_folder(session)
+    if session.network.security != "mtls":
+        if operator is not None:
+            raise SecurityError(
+                f'--as {operator}: without network.security = "mtls" nobody could tell who it is'
+            )
+        return SITES[SiteId.LOCAL]
+    names = sorted(place.name for place in folder.iterdir()) if folder.is_dir() else []
+    here = [Identity(name) for name in names if name.partition(".")[0] in PEOPLE]
+    if operator is None:
+        if len(here) == 1 and SITES[SiteId.LOCAL].name not in names:
+            return here[0]
+        if here:
+            raise SecurityError(
+                f"say who you are: --as NAME, of {', '.join(str(one.person) for one in here)}"
+            )
+        return SITES[SiteId.LOCAL]
+    for one in here:
+        if one.person == operator:
+            return one
+    known = ", ".join(str(one.person) for one in here) or "nobody"
+    raise SecurityError(
+        f"--as {operator}: {folder} has no keys of such an operator, but of {known}; "
+        f"`farhand keys SESSION.toml --operator {operator}` makes them"
+    )
+
+
 def _meet(
     session: Session, own: Identity, listens: list[Endpoint], dials: list[Endpoint]
 ) -> Meeting:
     network = session.network
     credentials = None
+    people: tuple[Identity, ...] = ()
     configuration: dict[str, Any] = {}
-    if own == ROUTER:
-        configuration |= _relay(session)
-    elif network.router is not None:
-        # peers of regions of their own, not clients: those cannot start before the router does
-        configuration["region_name"] = own.role.value
     if network.security == "mtls":
         credentials = load_credentials(keys_folder(session), own)
+        people = _people(credentials)
         _require_certificates(listens, dials)
-        configuration |= _mutual_tls(session, credentials)
+        configuration |= _mutual_tls(session, credentials, people)
+    if own == ROUTER:
+        configuration |= _relay(session, people)
+    elif network.router is not None:
+        # peers of regions of their own, not clients: those cannot start before the router does
+        configuration["region_name"] = _region(own).value
     if network.router is not None:
         listens, dials = [*map(_wide_area, listens)], [*map(_wide_area, dials)]
     warnings = _require_secrecy(network.allow_plaintext, [*listens, *dials])
@@ -122,11 +174,28 @@ def _meet(
         listen=tuple(one.text for one in listens),
         connect=tuple(one.text for one in dials),
         lease_ms=round(network.lease_s * 1e3),
+        open_timeout_ms=round(network.open_timeout_s * 1e3),
         tier=_tier(own, network.router is not None),
         config_file=network.zenoh_config,
         configuration=configuration,
     )
-    return Meeting(settings, credentials, tuple(warnings))
+    return Meeting(settings, credentials, tuple(warnings), people)
+
+
+def _people(credentials: Credentials) -> tuple[Identity, ...]:
+    """Return who is allowed to be at the local site, each under a name of his own."""
+    allowed = sorted(credentials.names_allowed(), key=lambda one: one.name)
+    people = tuple(one for one in allowed if one.role in PEOPLE)
+    if people and credentials.identity == SITES[SiteId.LOCAL]:
+        raise SecurityError(
+            "this session has operators, each with keys of his own: the keys of the local site "
+            "alone are not obeyed any more"
+        )
+    return people
+
+
+def _region(own: Identity) -> Role:
+    return Role.LOCAL if own.role in PEOPLE else own.role
 
 
 def _tier(own: Identity, routed: bool) -> int:
@@ -134,7 +203,7 @@ def _tier(own: Identity, routed: bool) -> int:
     if routed:
         return 1 if own == ROUTER else 0
     # observers dial both sites, the local site the remote one
-    return {Role.LOCAL: 1, Role.REMOTE: 2}.get(own.role, 0)
+    return {Role.LOCAL: 1, Role.REMOTE: 2}.get(_region(own), 0)
 
 
 def _require_certificates(listens: Sequence[Endpoint], dials: Sequence[Endpoint]) -> None:
@@ -171,9 +240,12 @@ def _require_secrecy(allow_plaintext: bool, endpoints: Sequence[Endpoint]) -> li
     return warnings
 
 
-def _mutual_tls(session: Session, credentials: Credentials) -> dict[str, Any]:
+def _mutual_tls(
+    session: Session, credentials: Credentials, people: Sequence[Identity]
+) -> dict[str, Any]:
     key, certificate = credentials.file(KEY_FILE), credentials.file(CERTIFICATE_FILE)
-    granted = grants(session.name, credentials.identity, session.network.router is not None)
+    routed = session.network.router is not None
+    granted = grants(session.name, credentials.identity, routed, people)
     return {
         "transport/link/tls": {
             "root_ca_certificate": credentials.file(AUTHORITY_FILE),
@@ -190,12 +262,22 @@ def _mutual_tls(session: Session, credentials: Credentials) -> dict[str, Any]:
     }
 
 
-def _relay(session: Session) -> Mapping[str, Any]:
+def _relay(session: Session, people: Sequence[Identity]) -> Mapping[str, Any]:
     """Return what makes a node the relay of a session, with its limits on size and rate."""
-    states = [state_key(session.name, site) for site in SiteId]
-    rows = [telemetry_key(session.name, site) for site in SiteId]
+    persons = [one.person for one in people if one.person is not None]
+    parties: list[tuple[SiteId, str | None]] = [(SiteId.LOCAL, one) for one in persons]
+    parties = [*(parties or [(SiteId.LOCAL, None)]), (SiteId.REMOTE, None)]
+    states = [state_key(session.name, *party) for party in parties]
+    rows = [telemetry_key(session.name, *party) for party in parties]
+    claims = [claim_key(session.name, one) for one in persons]
     most_hz = BURST * 1e9 / session.send_period_ns
-    sizes = (("state", states, MOST_STATE_BYTES), ("telemetry", rows, MOST_TELEMETRY_BYTES))
+    sizes = [
+        ("state", states, MOST_STATE_BYTES),
+        ("telemetry", rows, MOST_TELEMETRY_BYTES),
+        ("lease", [lease_key(session.name)], MOST_LEASE_BYTES),
+    ]
+    if claims:
+        sizes.append(("claim", claims, MOST_STATE_BYTES))
     regions = (Role.LOCAL, Role.REMOTE, Role.OBSERVER)
     return {
         "mode": "router",

@@ -42,8 +42,10 @@ class MetricsProcess:
         return None if code is None else f"no metrics: their process ended with code {code}"
 
     def close(self) -> None:
-        """End it."""
+        """End it; it has nothing to finish."""
         self._process.close(_END_S)
+        if self._process.exit_code is None:
+            self._process.kill()
 
     def __enter__(self) -> Self:
         return self

@@ -378,6 +378,19 @@ def test_a_restarted_peer_is_accepted_after_the_silence() -> None:
     assert wire.rejected == {Reject.EPOCH: 2}, "the old run does not come back"
 
 
+def test_a_run_that_was_replaced_may_be_welcomed_back() -> None:
+    """As when a robot is handed over and back."""
+    wire = Wire()
+    wire.hear(10 * MS, wire.packet(500))
+    wire.hear(80 * MS, wire.packet(1, epoch=2000, echo_stamp_ns=59 * MS, echo_arrival_ns=MS))
+    wire.channel.welcome_back()
+    wire.hear(81 * MS, wire.packet(501))
+    assert wire.rejected == {Reject.EPOCH: 1}, "not while the new one is heard"
+    wire.hear(200 * MS, wire.packet(502))
+    assert wire.rejected == {Reject.EPOCH: 1}
+    assert wire.channel.counters.peer_restarts == 2
+
+
 def test_a_restarted_peer_is_used_once_it_answers() -> None:
     wire = Wire()
     assert wire.hear(10 * MS, wire.packet(500, stamp_ns=MS)) is not None

@@ -56,6 +56,37 @@ def test_telemetry_reaches_a_subscriber_of_a_whole_branch(
     assert subscription.receive() == []
 
 
+def test_a_link_is_turned_from_one_peer_to_another_and_to_none(
+    nodes: tuple[ZenohNode, ZenohNode],
+) -> None:
+    here = nodes[0].link("session/remote", None)
+    peers = {name: nodes[1].link(f"session/{name}", "session/remote") for name in "ab"}
+
+    def heard() -> set[bytes]:
+        for name, peer in peers.items():
+            peer.send(name.encode())
+        return set(here.receive())
+
+    assert not here.peer_present()
+    assert heard() == set()
+    for name in "aba":
+        here.listen_to(f"session/{name}")
+        until(lambda name=name: heard() == {name.encode()})
+        until(here.peer_present)
+        for _ in range(20):
+            assert heard() <= {name.encode()}
+        here.listen_to(None)
+        for _ in range(20):
+            assert heard() == set()
+        assert not here.peer_present()
+    here.listen_to("session/b")
+    nodes[0].reopen()
+    until(lambda: heard() == {b"b"})
+    nodes[0].close()
+    here.listen_to("session/a")  # too late, and no error
+    assert heard() == set()
+
+
 @pytest.mark.parametrize("which", [0, 1])
 def test_a_node_that_opens_anew_is_heard_and_hears_while_its_loop_goes_on(
     nodes: tuple[ZenohNode, ZenohNode], which: int

@@ -44,6 +44,24 @@ def test_one_command_makes_everybody(session: Path) -> None:
     assert load_credentials(folder, Identity("lab")).hosts == ()
 
 
+def test_operators_are_made_instead_of_a_local_site(session: Path) -> None:
+    code, said = run("keys", session, "--operator", "alice", "--supervisor", "carol")
+    assert code == 0, said
+    folder = session.parent / "keys"
+    made = {path.name for path in folder.iterdir()}
+    assert made == {
+        "authority", "operator.alice", "supervisor.carol", "remote", "router", "dashboard"
+    }  # fmt: skip
+    names = read_allowed(folder / "remote" / ALLOWED_FILE)
+    assert {"operator.alice-1", "supervisor.carol-1"} < set(names)
+    code, said = run("keys", session, "--operator", "bob")
+    assert code == 0, said
+    assert not (folder / "local").exists()
+    code, said = run("keys", session, "--operator", "carol")
+    assert code == 2
+    assert "operator or supervisor, not both" in said
+
+
 def test_once_more_adds_who_is_new_and_leaves_the_others(session: Path) -> None:
     run("keys", session)
     folder = session.parent / "keys"

@@ -20,11 +20,16 @@ def write_session(
     stiffness_n_per_m: float = STIFFNESS_N_PER_M,
     zenoh_config: Path | None = None,
     operator: dict[str, object] | None = None,
+    profile: str | None = None,
+    channel: dict[str, object] | None = None,
 ) -> Path:
-    """Write the session file of one site and return its path; endpoints come by command line."""
+    """Write the session file of one site and return its path; endpoints come by command line.
+
+    A `profile` gives the lease too.
+    """
     document = tomlkit.parse((EXPERIMENTS / "demo.toml").read_text(encoding="utf-8")).unwrap()
     document["name"] = NAME
-    document["channel"] = {"injection": "off"}
+    document["channel"] = {"injection": "off"} | (channel or {})
     document["engagement"] = {
         "ramp_s": RAMP_S,
         "hold_after_s": HOLD_AFTER_S,
@@ -34,7 +39,10 @@ def write_session(
     document["coupling"]["force_ceiling_n"] = [CEILING_N] * 2
     if operator is not None:
         document["local"]["operator"] = operator
-    document["network"]["lease_s"] = lease_s
+    if profile is None:
+        document["network"]["lease_s"] = lease_s
+    else:
+        document["network"]["profile"] = profile
     document["network"]["allow_plaintext"] = True  # namespaces of our own
     if zenoh_config is not None:
         document["network"]["zenoh_config"] = str(zenoh_config)

@@ -59,7 +59,8 @@ class SitePair:
     """A local and a remote daemon on loopback, behind a router, or on an impaired network.
 
     On the network each site has its own side, and an observer there, so that telemetry never
-    crosses what is impaired. All are processes of one machine: all stamps are CLOCK_MONOTONIC.
+    crosses what is impaired; a router is on the local side. All are processes of one machine: all
+    stamps are CLOCK_MONOTONIC.
     """
 
     def __init__(
@@ -70,8 +71,14 @@ class SitePair:
         routed: bool = False,
         operator: dict[str, object] | None = None,
         orphan_s: float = ORPHAN_S,
+        protocol: str = "tcp",
+        profile: str | None = None,
+        channel: dict[str, object] | None = None,
     ) -> None:
         self._folder = folder
+        self._protocol = protocol
+        self._profile = profile
+        self._channel = channel
         self._network = network
         self._operator = operator
         self._orphan_s = orphan_s
@@ -117,6 +124,8 @@ class SitePair:
             self._folder / f"{site.label}_{time.monotonic_ns()}.toml",
             lease_s=LAN_LEASE_S if self._network is None else WAN_LEASE_S,
             zenoh_config=config,
+            profile=self._profile,
+            channel=self._channel,
             operator=self._operator,
             **changes,  # type: ignore[arg-type]
         )
@@ -159,9 +168,7 @@ class SitePair:
     def start_router(self) -> None:
         """Start the router that the sites were told of."""
         assert self._router_endpoint is not None
-        self._router = Companion(
-            [sys.executable, "-m", "tests.faults.router", self._router_endpoint]
-        )
+        self._router = Companion(self._command(LOCAL, "tests.faults.router", self._router_endpoint))
 
     def kill_router(self) -> None:
         """Kill it."""
@@ -288,7 +295,7 @@ class SitePair:
 
     def _free_endpoint(self, site: SiteId) -> str:
         address = "127.0.0.1" if self._network is None else self._network.address(site)
-        return f"tcp/{address}:{_free_port()}"
+        return f"{self._protocol}/{address}:{_free_port()}"
 
 
 def _free_port() -> int:

@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import tomlkit
@@ -44,10 +44,10 @@ def until(condition: Callable[[], bool], what: str, within_s: float = DEADLINE_S
         time.sleep(0.02)
 
 
-def make_keys(folder: Path) -> Authority:
+def make_keys(folder: Path, parties: Iterable[Identity] = PARTIES) -> Authority:
     """An authority, and a certificate of each party for 127.0.0.1."""
     authority = create_authority(folder, NAME)
-    for party in PARTIES:
+    for party in parties:
         authority.issue(party, LOOPBACK)
     return authority
 

@@ -1,5 +1,6 @@
 """Runs computed again from what was recorded of them: bit for bit, or else it is told where not."""
 
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -170,3 +171,28 @@ def test_what_is_not_whole_is_told(
     eventful: Pair, spoil: Callable[[Recording], Recording], why: str
 ) -> None:
     assert why in whole(spoil(recording_of(eventful, SiteId.LOCAL)))
+
+
+def test_a_run_whose_send_rate_adapted_comes_out_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = demo_session(rate_hz=500)
+    session = replace(free, channel=replace(free.channel, adapt_send_rate=True))
+    pair = Pair(session)
+    pair.run(1.0)
+    queues: defaultdict[MemoryLink, deque[bytes]] = defaultdict(deque)
+    send = MemoryLink.send
+
+    def behind_others(link: MemoryLink, data: bytes) -> bool:
+        queue = queues[link]
+        queue.append(data)
+        return len(queue) < 40 or send(link, queue.popleft())
+
+    with monkeypatch.context() as slow:
+        slow.setattr(MemoryLink, "send", behind_others)
+        pair.run(0.4)
+    pair.run(0.5)
+    for site in SiteId:
+        assert pair.sites[site].channel.slowed
+        assert pair.sites[site].channel.send_period_ns > session.send_period_ns
+        again = recompute(recording_of(pair, site), session, BUILD[site])
+        assert len(again.computed) > 700
+        assert again.differing == {}

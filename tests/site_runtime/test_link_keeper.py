@@ -64,9 +64,15 @@ def test_a_peer_that_does_not_answer_has_the_link_opened_anew_less_and_less_ofte
     assert watched.opened_s[-1] - watched.opened_s[-2] == LONGEST_S
 
 
-def test_one_that_has_never_answered_counts_as_well(watched: Watched) -> None:
+def test_one_that_has_never_answered_counts_as_well(
+    watched: Watched, capsys: pytest.CaptureFixture[str]
+) -> None:
     watched.pass_time(4, speaks=False, hears=False)
     assert watched.opened_s == [UNHEARD_S]
+    assert capsys.readouterr().err == ""  # behind a router it may just not have been started
+    watched.pass_time(11, speaks=True, hears=False)
+    assert len(watched.opened_s) == 2
+    assert "opened anew" in capsys.readouterr().err
 
 
 def test_an_outage_is_waited_out(watched: Watched) -> None:

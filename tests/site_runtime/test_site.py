@@ -23,6 +23,7 @@ from site_runtime.operator_requests import (
     CLUTCH_BUTTON,
     EMERGENCY_STOP,
     RESET,
+    UNLEASED,
     OperatorRequests,
 )
 from site_runtime.site import LateError, Site, SiteTimes
@@ -483,6 +484,28 @@ def test_the_row_tells_what_the_operator_asked_for(bench: Bench) -> None:
     bench.requests.reset()
     bench.tick()
     assert bench.row()["requests"] == RESET
+
+
+def test_without_the_lease_the_outputs_go_off_and_the_row_tells_of_it(bench: Bench) -> None:
+    bench.engage()
+    bench.requests.unleased = True
+    for _ in range(1000):
+        bench.tick()
+    assert bench.row()["requests"] == UNLEASED
+    assert bench.row()["state"] == State.READY
+    bench.requests.unleased = False
+    bench.tick()
+    assert bench.row()["requests"] == 0
+
+
+def test_what_other_threads_tell_is_an_event_each_tick(bench: Bench) -> None:
+    bench.engage()
+    before = len(bench.events)
+    bench.site.notices.extend(["lease: one", "lease: two"])
+    bench.tick()
+    assert [text for _, text in bench.events[before:]] == ["lease: one"]
+    bench.tick()
+    assert [text for _, text in bench.events[before:]] == ["lease: one", "lease: two"]
 
 
 def test_the_row_tells_when_each_stage_of_the_tick_was_passed(

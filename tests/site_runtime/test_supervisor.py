@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from math import inf
 from typing import Any
 
@@ -909,3 +910,66 @@ def test_the_point_told_moves_with_the_hand_or_not_at_all(
             error = np.array(side.target) - own
             assert side.peer is not None
             assert error == pytest.approx(side.peer - told, abs=1e-12)
+
+
+@pytest.mark.parametrize("start", [State.READY, State.ENGAGED, State.HOLD])
+def test_without_the_lease_the_force_goes_and_then_the_outputs(start: State) -> None:
+    side = ready()
+    if start is not State.READY:
+        side.ticks(RAMP + 10)
+        assert side.state is State.ENGAGED
+    if start is State.HOLD:
+        side.ticks(25, heard=False)
+        assert side.state is State.HOLD
+    shares = [side.share] if start is not State.READY else []
+    for _ in range(RELEASE + 5):
+        side.tick(unleased=True)
+        if side.state in DRIVEN:
+            shares.append(side.share)
+    assert side.state is State.READY
+    assert side.cause is Cause.UNLEASED
+    if shares:
+        assert shares[-1] < 0.01
+        steepest = 1.875 / RELEASE + 1e-6
+        assert all(0 <= before - after <= steepest for before, after in pairwise(shares))
+    side.ticks(100, unleased=True)
+    assert side.state is State.READY
+    side.tick()
+    assert side.state is State.ENGAGED
+
+
+def test_a_lease_that_comes_back_does_not_stop_the_release() -> None:
+    side = ready()
+    side.ticks(RAMP + 10)
+    side.tick(unleased=True)
+    states = [side.tick() for _ in range(RELEASE + 5)]
+    assert states[0] is State.HOLD
+    assert State.READY in states
+    first = states.index(State.READY)
+    assert set(states[:first]) == {State.HOLD}
+
+
+def test_the_end_of_the_lease_is_not_slower_than_the_end_of_a_long_hold() -> None:
+    side = ready()
+    side.ticks(RAMP + 10)
+    side.ticks(20 + 300 - 10, heard=False)
+    assert side.state is State.HOLD
+    side.ticks(15, heard=False, unleased=True)
+    assert side.state is State.READY
+
+
+def test_an_open_clutch_ends_with_the_lease() -> None:
+    side = ready()
+    side.ticks(RAMP + 10)
+    side.tick(clutch=True)
+    assert side.state is State.RELEASED
+    side.ticks(RELEASE + 2, clutch=True, unleased=True)
+    assert side.state is State.READY
+
+
+@pytest.mark.parametrize("unleased", [False, True])
+def test_the_emergency_stop_comes_before_the_lease(unleased: bool) -> None:
+    side = ready()
+    side.ticks(RAMP + 10)
+    side.tick(emergency_stop=True, unleased=unleased)
+    assert side.state is State.EMERGENCY_STOP

@@ -66,6 +66,7 @@ def test_a_state_is_told_when_it_changes_and_at_first() -> None:
         ({}, {"state": 7}, "ERROR", "local is EMERGENCY_STOP"),
         ({"state": 7, "requests": 8}, {"state": 1}, "INFO", "READY: its operator reset it"),
         ({"state": 4}, {"state": 1}, "INFO", "local is READY"),
+        ({}, {"state": 3, "requests": 16}, "WARN", "local is HOLD: nobody here holds the lease"),
         ({"state": 3, "requests": 8}, {"state": 1}, "INFO", "local is READY"),
         ({}, {"state": 3, "peer_state": 4}, "WARN", "local is HOLD: the peer is FAULT"),
         (

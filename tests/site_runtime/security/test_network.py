@@ -1,12 +1,13 @@
 """How a session's parties meet: endpoints, plain text, certificates, access control."""
 
+import shutil
 from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
 from channel.zenoh_link import ZenohSettings
-from site_runtime.keys import SiteId, state_key, telemetry_key
+from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
 from site_runtime.security.access import access_control, grants
 from site_runtime.security.authority import Authority, create_authority
 from site_runtime.security.endpoints import Endpoint
@@ -220,6 +221,71 @@ def test_nobody_says_what_is_another_partys(routed: bool) -> None:
                 assert role is not Role.OBSERVER or poses not in grant.hears
             assert role is not Role.OBSERVER or grant.says == ()
             assert not any("**" in key for key in (*grant.says, *grant.hears))
+
+
+PEOPLE = (Identity("operator.alice"), Identity("operator.bob"), Identity("supervisor.carol"))
+
+
+@pytest.mark.parametrize("routed", [False, True])
+def test_operators_say_nothing_in_each_others_name(routed: bool) -> None:
+    for own in (*SITES.values(), EYE, *PEOPLE, *([ROUTER] if routed else [])):
+        for party, grant in grants("s", own, routed, PEOPLE).items():
+            assert party is not Role.LOCAL
+            for one in PEOPLE:
+                keys = {
+                    claim_key("s", one.person),
+                    state_key("s", LOCAL, one.person),
+                    telemetry_key("s", LOCAL, one.person),
+                }
+                assert party in (one, Role.ROUTER) or not keys & set(grant.says)
+            assert lease_key("s") not in grant.says or party in (Role.REMOTE, Role.ROUTER)
+            assert party is not Role.OBSERVER or grant.says == ()
+    for one in PEOPLE:  # what a node may be asked to say is what it may say
+        (own_grant,) = [
+            grant
+            for party, grant in grants("s", one, routed, PEOPLE).items()
+            if party in (Role.ROUTER, Role.REMOTE)
+        ]
+        others = [key for key in own_grant.hears if f"/{one.person}" not in key]
+        assert others == []
+
+
+def test_each_person_is_a_subject_of_access_control() -> None:
+    allowed = {one: f"{one.name}-1" for one in PEOPLE} | {SITES[LOCAL]: "local-1"}
+    control = access_control(grants("s", SITES[REMOTE], False, PEOPLE), allowed)
+    subjects = {one["id"]: one["cert_common_names"] for one in control["subjects"]}
+    assert subjects == {one.name: [f"{one.name}-1"] for one in PEOPLE}
+
+
+def test_who_is_at_the_local_site(tmp_path: Path, authority: Authority) -> None:
+    loaded = session(tmp_path, SECURE)
+    assert meet_as_site(loaded, LOCAL).person is None
+    for one in PEOPLE[:2]:
+        authority.issue(one, ["127.0.0.1"])
+    with pytest.raises(SecurityError, match="--as NAME, of alice, bob"):
+        meet_as_site(loaded, LOCAL)
+    meeting = meet_as_site(loaded, LOCAL, operator="bob")
+    assert (meeting.person, meeting.people) == ("bob", PEOPLE[:2])
+    with pytest.raises(SecurityError, match="no keys of such an operator"):
+        meet_as_site(loaded, LOCAL, operator="eve")
+    with pytest.raises(SecurityError, match="an operator is at the local site"):
+        meet_as_site(loaded, REMOTE, operator="bob")
+    shutil.rmtree(authority.folder / "operator.alice")
+    with pytest.raises(SecurityError, match="say who you are"):
+        meet_as_site(loaded, LOCAL)
+    (authority.folder / "local").rename(tmp_path / "local")
+    assert meet_as_site(loaded, LOCAL).person == "bob"  # the only one here
+    with pytest.raises(SecurityError, match="nobody could tell who it is"):
+        meet_as_site(session(tmp_path, ""), LOCAL, operator="bob")
+
+
+def test_the_keys_of_a_nameless_local_site_end_with_the_first_operator(
+    tmp_path: Path, authority: Authority
+) -> None:
+    authority.issue(PEOPLE[0], ["127.0.0.1"])
+    shutil.rmtree(authority.folder / PEOPLE[0].name)  # on another machine
+    with pytest.raises(SecurityError, match="not obeyed any more"):
+        meet_as_site(session(tmp_path, SECURE), LOCAL)
 
 
 def test_the_demo_stays_as_it_is() -> None:

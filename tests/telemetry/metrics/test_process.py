@@ -136,3 +136,10 @@ def test_one_that_cannot_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("telemetry.metrics.process._MODULE", "telemetry.absent")
     with pytest.raises(TelemetryError, match="their process ended at once"):
         Run()
+
+
+def test_one_that_does_not_end_is_ended(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("telemetry.metrics.process._END_S", 0.2)
+    os.kill(run.metrics.pid, signal.SIGSTOP)
+    run.metrics.close()
+    assert run.metrics.trouble == "no metrics: their process ended with code -9"

@@ -1,0 +1,118 @@
+"""`farhand link-test` between two processes on loopback."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from channel.delay import TraceDelay
+from channel.zenoh_link import ZenohNode, ZenohSettings
+
+pytestmark = pytest.mark.processes
+
+ROOT = Path(__file__).parents[2]
+DEADLINE_S = 60.0
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    """The demo's session on ports of its own."""
+    text = (ROOT / "experiments" / "demo.toml").read_text(encoding="utf-8")
+    remote, local = _free_port(), _free_port()
+    path = tmp_path / "session.toml"
+    path.write_text(text.replace("7447", str(remote)).replace("7448", str(local)), encoding="utf-8")
+    return path
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+
+
+def ask(session: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "farhand", "link-test", str(session), *arguments],
+        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+    )  # fmt: skip
+
+
+def test_both_ends_measure_the_path_and_keep_its_delays(session: Path, tmp_path: Path) -> None:
+    with running("farhand", "link-test", str(session), "--answer") as answering:
+        asked = ask(
+            session, "--duration", "3", "--rate", "1000", "--rate", "200",
+            "--save", str(tmp_path / "kept"), "--json",
+        )  # fmt: skip
+        assert answering.poll() is None
+    assert asked.returncode in (0, 1), asked.stderr  # 1: this machine was too busy for it
+    told = json.loads(asked.stdout)
+    assert [one["rate_hz"] for one in told["rates"]] == [1000, 200]
+    for one in told["rates"]:
+        assert 0.0 < one["round_trip"]["p50_s"] < 0.1
+        assert one["round_trip"]["p50_s"] <= one["loop"]["p50_s"] + 0.002
+        assert one["loop"]["p50_s"] <= one["bound"]["p50_s"]
+        for way in ("to_remote", "to_local"):
+            # a site that is late sends less, never more
+            assert 0.3 * 1.5 * one["rate_hz"] < one[way]["sent"] < 1.2 * 1.5 * one["rate_hz"]
+            assert one[way]["lost"] < 0.5
+    # 200 a second, each on the way for next to no time: the loop waits for the packets
+    assert told["rates"][1]["loop"]["p50_s"] > 0.003
+    assert told["certified_round_trip_s"] == pytest.approx(0.298)
+    for name in ("local_to_remote", "remote_to_local"):
+        delay = TraceDelay(str(tmp_path / "kept" / f"{name}.csv"))
+        assert 0.0 <= delay.at(0.5, np.random.default_rng(0)) <= delay.bound_s < 2.0
+
+
+def test_a_place_that_is_taken_is_told(session: Path) -> None:
+    port = session.read_text(encoding="utf-8").split('local_listen = "')[1].split('"')[0]
+    node = ZenohNode(ZenohSettings(listen=(port,)))
+    try:
+        asked = ask(session)
+    finally:
+        node.close()
+    assert asked.returncode == 2
+    assert port in asked.stderr
+    assert "a site, or another link test" in asked.stderr
+
+
+def test_a_site_that_runs_is_told_and_a_rate_that_no_site_has(session: Path) -> None:
+    assert "must divide loop.rate_hz = 1000" in ask(session, "--rate", "300").stderr
+    with running("remote_site", str(session), "--no-record"):
+        time.sleep(1.0)
+        asked = ask(session)
+    assert asked.returncode == 2
+    assert "the remote site of this session is running" in asked.stderr
+
+
+def test_another_session_file_at_the_other_end_is_told(session: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    text = session.read_text(encoding="utf-8")
+    other.write_text(text.replace("seed = 1", "seed = 2"), encoding="utf-8")
+    with running("farhand", "link-test", str(other), "--answer"):
+        asked = ask(session)
+    assert asked.returncode == 2
+    assert "ANOTHER session file" in asked.stderr
