@@ -325,12 +325,16 @@ class Site:
             self.round_trip_s = nan if trip_ns is None else trip_ns * 1e-9
         offset_ns, uncertainty_ns = channel.offset or _NO_OFFSET
         counters = channel.counters
+        read_ns, step_ns, write_ns, sent_ns = self._stages_ns
         self.telemetry.put(  # in the order of COLUMNS
             now_ns,
             now_ns - self._times.session_start_ns,
             lateness_ns,
             self._duration_ns,
-            *self._stages_ns,
+            read_ns,
+            step_ns,
+            write_ns,
+            sent_ns,
             state,
             peer_state,
             asked,
