@@ -256,11 +256,11 @@ class Supervisor:
         late: bool,
     ) -> Cause | None:
         """Return what forbids to be ENGAGED now; None if nothing does."""
-        rules = self._rules
-        anew = presence.counters.peer_restarts != self._peer_restarts
-        self._peer_restarts = presence.counters.peer_restarts
-        off = self._peer_drove and presence.heard_state in _OUTPUTS_OFF
-        self._peer_drove = presence.heard_state in DRIVEN
+        rules, restarts, heard = self._rules, presence.counters.peer_restarts, presence.heard_state
+        anew = restarts != self._peer_restarts
+        self._peer_restarts = restarts
+        off = self._peer_drove and heard in _OUTPUTS_OFF
+        self._peer_drove = heard in DRIVEN
         self._peer_anew = self._peer_anew or anew or off
         heard_ns, before_ns = presence.heard_ns, self._updated_ns
         # after a stall of this site itself the peer's point is elsewhere: hold, then blend
@@ -271,7 +271,7 @@ class Supervisor:
         if now_ns - heard_ns > rules.hold_after_ns:
             return Cause.SILENT
         # the sample in use is older than the state heard, perhaps from before a reset
-        if presence.heard_state not in _PEER_FIT or peer.state not in _PEER_FIT:
+        if heard not in _PEER_FIT or peer.state not in _PEER_FIT:
             return Cause.PEER_UNFIT
         if anew or off:
             return Cause.PEER_ANEW if anew else Cause.PEER_OFF

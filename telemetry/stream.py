@@ -74,6 +74,7 @@ class TelemetryStream:
         self._capacity = RING_BATCHES * batch_rows
         self._count = 0
         self._flushed = 0
+        self._batch_ends = batch_rows
         self._dropped = 0
         layout = RingLayout(site, joints, dimension, self._capacity, session_digest, epoch)
         self.ring = RowRing.create(layout, allocate)
@@ -239,13 +240,11 @@ class TelemetryStream:
 
     def flush(self) -> None:
         """Publish every full batch not yet published; nothing to do in most ticks."""
-        self._forget_overwritten()
-        while self._count // self._batch_rows > self._flushed // self._batch_rows:
+        while self._count >= self._batch_ends:
             self._publish_batch()
 
     def drain(self) -> None:
         """Publish all that is left, the last batch full or not; for the end of a session."""
-        self._forget_overwritten()
         while self._count > self._flushed:
             self._publish_batch()
 
@@ -262,6 +261,7 @@ class TelemetryStream:
             self._flushed = oldest
 
     def _publish_batch(self) -> None:
+        self._forget_overwritten()
         # Up to the next multiple of the batch size, so never across the ring's end.
         rows = min(self._batch_rows - self._flushed % self._batch_rows, self._count - self._flushed)
         start = self._flushed % self._capacity
@@ -269,6 +269,7 @@ class TelemetryStream:
             MAGIC, LAYOUT_VERSION, *self._shape, rows, *self._session, self._flushed
         )
         self._flushed += rows
+        self._batch_ends = (self._flushed // self._batch_rows + 1) * self._batch_rows
         self._publish(header + self._ring[start : start + rows].tobytes())
 
 

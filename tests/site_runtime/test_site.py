@@ -531,6 +531,12 @@ def test_the_row_tells_which_sample_is_in_use_and_the_clocks_offset(bench: Bench
     row = bench.row()
     assert row["used_stamp_ns"] == row["used_arrival_ns"] == row["stamp_ns"]  # one clock, no way
     assert abs(row["clock_offset_ns"]) <= row["clock_uncertainty_ns"] <= MS
+    said_ns, rest = bench.clock.now_ns() + MS, np.zeros(2)
+    bench.clock.sleep_until_ns(said_ns)
+    assert bench.peer.send(said_ns, bench.peer_state, bench.peer_position, rest, rest)
+    bench.tick(peer_speaks=False)
+    row = bench.row()
+    assert (row["used_stamp_ns"], row["used_arrival_ns"]) == (said_ns, row["stamp_ns"])
 
 
 def test_the_row_tells_what_was_refused_by_reason(bench: Bench) -> None:

@@ -103,6 +103,9 @@ def test_flush_publishes_full_batches_only_and_drain_the_rest() -> None:
     batches = [decode_batch(payload).rows for payload in published]
     assert [len(rows) for rows in batches] == [5, 5, 3]
     assert_rows_are(np.concatenate(batches), range(13))
+    put(stream, [13, 14])
+    stream.flush()  # batches end where they would have ended
+    assert decode_batch(published[-1]).rows["sequence"].tolist() == [13, 14]
     assert stream.dropped_rows == 0
 
 
