@@ -1,11 +1,11 @@
 """An operator's side of the lease: claims the remote robot for as long as the local site runs."""
 
-import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
+from site_runtime.keeper import Keeper
 from site_runtime.lease import Verb, Wish
 from site_runtime.lease_keeper import Ear
 from site_runtime.lease_messages import RemoteStatus, decode_status, encode_wish
@@ -16,7 +16,7 @@ _SILENT_S: Final = 4.0
 _FAREWELLS: Final = 3
 
 
-class LeaseClaimant:
+class LeaseClaimant(Keeper):
     """Claims in one operator's name, from a thread of its own, in a `with` statement.
 
     Who holds the robot instead is its trouble, for the status line, and an event. The site stays
@@ -27,6 +27,7 @@ class LeaseClaimant:
     def __init__(
         self, person: str, epoch: int, site: Site, ear: Ear, publish: Callable[[bytes], None]
     ) -> None:
+        super().__init__("lease", CLAIM_S)
         self._person = person
         self._epoch = epoch
         self._site = site
@@ -36,13 +37,7 @@ class LeaseClaimant:
         self._heard_s = time.monotonic()
         self._trouble: str | None = None
         self._told = ""
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._claim, name="lease", daemon=True)
         site.requests.unleased = True
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
 
     def __exit__(
         self,
@@ -50,8 +45,7 @@ class LeaseClaimant:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._ended.set()
-        self._thread.join(timeout=1.0)
+        super().__exit__(kind, error, traceback)
         release = encode_wish(Wish(Verb.RELEASE, time.time_ns()))
         for _ in range(_FAREWELLS):  # a lost one costs the next operator the time of expiry
             self._publish(release)
@@ -90,7 +84,3 @@ class LeaseClaimant:
         if text != self._told:
             self._site.notices.append(text)
         self._trouble, self._told = trouble, text
-
-    def _claim(self) -> None:
-        while not self._ended.wait(CLAIM_S):
-            self.look()

@@ -1,13 +1,12 @@
 """The remote site's side of the lease: hears claims, lets one operator through, tells how it is."""
 
-import threading
 from collections.abc import Callable, Mapping
 from math import isfinite
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 from site_runtime.assembly import TAKEOVER_NS
 from site_runtime.clock import Clock
+from site_runtime.keeper import Keeper
 from site_runtime.keys import SiteId, state_key
 from site_runtime.lease import Lease, LeaseRules, Step, Verb, hear, look
 from site_runtime.lease_messages import Answer, RemoteStatus, decode_wish, encode_status
@@ -45,7 +44,7 @@ def rules_of(session: Session, people: tuple[Identity, ...]) -> LeaseRules:
     )
 
 
-class LeaseKeeper:
+class LeaseKeeper(Keeper):
     """Keeps the lease of one remote site from a thread of its own, in a `with` statement.
 
     `ears` are by operator; without any, whoever comes first is obeyed, and it only tells how the
@@ -63,6 +62,7 @@ class LeaseKeeper:
         rules: LeaseRules,
         publish: Callable[[bytes], None],
     ) -> None:
+        super().__init__("lease", LOOK_S)
         self._session = session
         self._site = site
         self._epoch = epoch
@@ -77,22 +77,7 @@ class LeaseKeeper:
         self._obeyed: str | None = None
         self._deaf_ticks = 0
         self._told_ns: int | None = None
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
         site.requests.unleased = bool(ears)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._ended.set()
-        self._thread.join(timeout=1.0)
 
     @property
     def lease(self) -> Lease:
@@ -176,7 +161,3 @@ class LeaseKeeper:
             and site.state not in DRIVEN
             and (heard_ns is None or now_ns - heard_ns >= self._silence_ns)
         )
-
-    def _keep(self) -> None:
-        while not self._ended.wait(LOOK_S):
-            self.look()

@@ -1,12 +1,11 @@
 """Sees to it that a link that is connected and yet dead is opened anew."""
 
-import threading
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 from channel.channel import Channel
 from site_runtime.clock import Clock
 from site_runtime.daemon_log import DaemonLog
+from site_runtime.keeper import Keeper
 
 UNHEARD_S: Final = 3.0
 """So long must the peer not answer: longer than any round trip of a usable network."""
@@ -27,7 +26,7 @@ class Connection(Protocol):
         """Leave the network and join it anew, however long it takes."""
 
 
-class LinkKeeper:
+class LinkKeeper(Keeper):
     """Watches one site's channel from a thread of its own, in a `with` statement.
 
     Only the site that dials can mend a connection, and only where one stands: an outage is waited
@@ -37,6 +36,7 @@ class LinkKeeper:
     def __init__(
         self, channel: Channel, connection: Connection, clock: Clock, log: DaemonLog
     ) -> None:
+        super().__init__("link", _LOOK_S)
         self._channel = channel
         self._connection = connection
         self._clock = clock
@@ -44,21 +44,6 @@ class LinkKeeper:
         self._refused = 0
         self._patience_s = UNHEARD_S
         self._well_ns = clock.now_ns()
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="link", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._ended.set()
-        self._thread.join(timeout=1.0)
 
     def look(self) -> None:
         """Open the link anew if it has been connected for so long, and the peer not answered."""
@@ -82,10 +67,6 @@ class LinkKeeper:
         if refused != before or (channel.peer_taken and _recent(channel.heard_ns, now_ns)):
             return True
         return _recent(channel.echoed_ns, now_ns)
-
-    def _watch(self) -> None:
-        while not self._ended.wait(_LOOK_S):
-            self.look()
 
 
 def _recent(stamp_ns: int | None, now_ns: int) -> bool:
