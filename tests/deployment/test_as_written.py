@@ -24,7 +24,6 @@ from tests.deployment.page import ROOT, Page
 from tests.faults import namespace
 from tests.loopback.secured import until, write_session
 
-
 DEPLOYMENT = "docs/deployment.md"
 ROUTED = (
     "2. The session",
