@@ -52,6 +52,7 @@ PARTIES = {
 SHORTER = {"--duration 60": "--duration 2 --rate 200"}
 ADDED = {"dashboard": " --save seen.rrd", "doctor": " --seconds 0.3"}
 RATE_HZ = 200  # of the loops: five programs and more share the cores of the test's machine
+STYLES = 2  # chunks of a line on a dashboard that hears nothing: how it is drawn
 RECORDED = 100_000  # bytes of a site's rows: seconds
 
 
@@ -131,13 +132,13 @@ def as_a_service(machine: Machine, unit: str) -> Program:
     return machine.start(command.replace("/etc/farhand", str(machine.folder)))
 
 
-def shown(machine: Machine) -> str:
-    """What a dashboard that has ended was shown."""
+def shows_both(desk: Machine) -> bool:
+    """Whether the desk's dashboard has been told torques of both sites by now."""
     tool = Path(rerun_cli.__file__).with_name("rerun")
-    saved = machine.folder / "seen.rrd"
-    return subprocess.run(
-        [tool, "rrd", "stats", saved], capture_output=True, text=True, check=True, timeout=60
-    ).stdout
+    command = [tool, "rrd", "stats", "--continue-on-error", desk.folder / "seen.rrd"]
+    stats = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60).stdout
+    chunks = dict(re.findall(r"^/torque/(\w+): (\d+)$", stats, re.MULTILINE))
+    return all(int(chunks.get(site, 0)) > STYLES for site in ("local", "remote"))
 
 
 def seconds_of_both(recording: Path) -> bool:
@@ -199,6 +200,7 @@ def through_a_relay(machines: Machines) -> None:
 
     recording = machines["recorder"].folder / "try-1"
     until(lambda: seconds_of_both(recording), "rows of both sites")
+    until(lambda: shows_both(machines["desk"]), "both sites on the dashboard")
     assert recorder.interrupt() == 0
     runs = {run.metadata["site"]: run
             for run in recorded_runs(recording_files([recording]))}  # fmt: skip
@@ -209,7 +211,6 @@ def through_a_relay(machines: Machines) -> None:
         assert len(run.rows) > RATE_HZ
         assert run.rows["state"][-1] == State.ENGAGED
     assert dashboard.interrupt() == 0
-    assert all(f"/torque/{site}" in shown(machines["desk"]) for site in runs)
     assert [site.interrupt() for site in (local, remote, router)] == [0, 0, 0]
 
     certificates = office.run(page.take("farhand", "keys", "show").text)
@@ -257,18 +258,13 @@ def without_a_relay(machines: Machines) -> None:
     dashboard = start(machines, page, "dashboard")
     engaged(remote, local)
     said(dashboard, "dashboard: http")
-    page_is_done(machines, page, machines["desk"], dashboard, local, remote)
+    page_is_done(page, machines["desk"], dashboard, local, remote)
 
 
-def page_is_done(
-    machines: Machines, page: Page, desk: Machine, dashboard: Program, *sites: Program
-) -> None:
-    """What the dashboard saves grows; then all end well, and no command is left."""
-    saved = desk.folder / "seen.rrd"
-    before = saved.stat().st_size
-    until(lambda: saved.stat().st_size > before + 20_000, "the dashboard is shown something")
+def page_is_done(page: Page, desk: Machine, dashboard: Program, *sites: Program) -> None:
+    """The dashboard shows both sites, all end well, and no command is left."""
+    until(lambda: shows_both(desk), "both sites on the dashboard")
     assert dashboard.interrupt() == 0
-    assert all(f"/torque/{site}" in shown(desk) for site in ("local", "remote"))
     assert [site.interrupt() for site in sites] == [0] * len(sites)
     assert left(page) == []
 
@@ -294,4 +290,4 @@ def two_machines(machines: Machines) -> None:
     remote, local = start(machines, page, "remote"), start(machines, page, "local")
     dashboard = start(machines, page, "dashboard")
     engaged(remote, local)
-    page_is_done(machines, page, a, dashboard, local, remote)
+    page_is_done(page, a, dashboard, local, remote)
