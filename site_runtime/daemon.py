@@ -204,7 +204,7 @@ def run_daemon(
                 _status(site, (recorder, metrics), _shown(lease), log, options),
                 lease,
                 LinkKeeper(site.channel, node, clock, log),
-                _told(manager, site),
+                _service_keeper(manager, site),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -260,7 +260,9 @@ def _lease(
     )
 
 
-def _told(manager: ServiceManager, site: Site) -> ServiceKeeper | AbstractContextManager[None]:
+def _service_keeper(
+    manager: ServiceManager, site: Site
+) -> ServiceKeeper | AbstractContextManager[None]:
     return ServiceKeeper(manager, lambda: site.ticks) if manager.listens else nullcontext()
 
 

@@ -170,6 +170,14 @@ def test_a_site_whose_loop_hangs_pings_no_more_though_its_other_threads_live(
 
 @pytest.mark.processes
 @pytest.mark.parametrize("ear", ["path"], indirect=True)
+def test_a_site_that_cannot_start_is_never_ready(ear: Ear, start, tmp_path: Path) -> None:
+    process = start("remote_site", tmp_path / "absent.toml")
+    assert process.wait(DEADLINE_S) == 2
+    assert ear.waiting() == []
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("ear", ["path"], indirect=True)
 def test_a_suspended_relay_pings_no_more(ear: Ear, start, tmp_path: Path) -> None:
     session = tmp_path / "session.toml"
     router = endpoint()
