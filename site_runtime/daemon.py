@@ -27,6 +27,7 @@ from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
 from site_runtime.security.network import Meeting, meet_as_site
+from site_runtime.service_manager import ServiceKeeper, ServiceManager
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
 from site_runtime.site_events import Companion, SiteEvents
@@ -159,6 +160,7 @@ def run_daemon(
         with (
             closing(ZenohNode(meeting.settings)) as node,
             closing(SharedMemory()) as memory,
+            closing(ServiceManager()) as manager,
         ):
             link = node.link(
                 state_key(session.name, identity, meeting.person),
@@ -202,6 +204,7 @@ def run_daemon(
                 _status(site, (recorder, metrics), _shown(lease), log, options),
                 lease,
                 LinkKeeper(site.channel, node, clock, log),
+                _service_keeper(manager, site),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -255,6 +258,12 @@ def _lease(
         node.subscriber(lease_key(name), _WORDS),
         node.publisher(claim_key(name, meeting.person)),
     )
+
+
+def _service_keeper(
+    manager: ServiceManager, site: Site
+) -> ServiceKeeper | AbstractContextManager[None]:
+    return ServiceKeeper(manager, lambda: site.ticks) if manager.listens else nullcontext()
 
 
 def _while_leased(
