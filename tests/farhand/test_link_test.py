@@ -2,7 +2,6 @@
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ import pytest
 
 from channel.delay import TraceDelay
 from channel.zenoh_link import ZenohNode, ZenohSettings
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 
@@ -26,16 +26,10 @@ DEADLINE_S = 60.0
 def session(tmp_path: Path) -> Path:
     """The demo's session on ports of its own."""
     text = (ROOT / "experiments" / "demo.toml").read_text(encoding="utf-8")
-    remote, local = _free_port(), _free_port()
+    remote, local = free_port(), free_port()
     path = tmp_path / "session.toml"
     path.write_text(text.replace("7447", str(remote)).replace("7448", str(local)), encoding="utf-8")
     return path
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """`farhand list` and `farhand lease` where nobody shows a certificate."""
 
 import json
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -14,6 +13,7 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from farhand.__main__ import app
 from site_runtime.keys import lease_key
 from site_runtime.lease_messages import RemoteStatus, encode_status
+from tests.ports import free_port
 
 DEMO = Path(__file__).parents[2] / "experiments" / "demo.toml"
 
@@ -21,9 +21,7 @@ DEMO = Path(__file__).parents[2] / "experiments" / "demo.toml"
 @pytest.fixture
 def endpoint() -> Iterator[str]:
     """A site that tells of two robots, one of them twice, and nonsense."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     over = threading.Event()
     with closing(ZenohNode(ZenohSettings(listen=(endpoint,)))) as node:
         arm, hand = node.publisher(lease_key("arm")), node.publisher(lease_key("hand"))

@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -25,6 +24,7 @@ from tests.faults.network import ImpairedNetwork
 from tests.faults.observer import Recording
 from tests.faults.session import NAME, write_session
 from tests.faults.wall_clock import WallClock
+from tests.ports import free_port
 
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
 BOTH = (LOCAL, REMOTE)
@@ -93,7 +93,7 @@ class SitePair:
         self.files = {site: self.write_session(site) for site in BOTH}
         # one a side, or one for all
         sides = BOTH if network is not None else (LOCAL,)
-        self._observer_endpoints = {site: f"tcp/127.0.0.1:{_free_port()}" for site in sides}
+        self._observer_endpoints = {site: f"tcp/127.0.0.1:{free_port()}" for site in sides}
         recordings = {site: folder / f"observed_{site.label}.rows" for site in sides}
         self._observers = [
             Companion(
@@ -295,11 +295,4 @@ class SitePair:
 
     def _free_endpoint(self, site: SiteId) -> str:
         address = "127.0.0.1" if self._network is None else self._network.address(site)
-        return f"{self._protocol}/{address}:{_free_port()}"
-
-
-def _free_port() -> int:
-    """Return a port that nobody has on this machine, so in a fresh namespace neither."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+        return f"{self._protocol}/{address}:{free_port()}"

@@ -22,12 +22,12 @@ from tests.loopback.secured import (
     NAME,
     ORPHAN_S,
     ROOT,
-    free_port,
     make_keys,
     tls,
     until,
     write_session,
 )
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 PARTIES = tuple(

@@ -6,7 +6,6 @@ age of its peer's samples can be held against the peer's own record.
 
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,6 +22,7 @@ from site_runtime.keys import SiteId, telemetry_key
 from site_runtime.supervisor import DRIVEN, State
 from telemetry.rows import NO_PEER_STATE, RowArray
 from telemetry.stream import decode_batch
+from tests.ports import free_port
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -241,13 +241,7 @@ class Rig:
 
 
 def free_endpoints(count: int) -> list[str]:
-    probes = [socket.socket() for _ in range(count)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    endpoints = [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in probes]
-    for probe in probes:
-        probe.close()
-    return endpoints
+    return [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
 
 
 @pytest.fixture
