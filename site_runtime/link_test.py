@@ -12,6 +12,7 @@ from channel.link import Link, LinkError, TappedLink
 from channel.packet import Packet, PacketError, Reject, decode
 from site_runtime.clock import Clock, Pacer
 from site_runtime.keys import SiteId
+from site_runtime.security.network import most_relayed_hz
 from site_runtime.session import Session
 
 RATE_DIVISORS: Final = (1, 2, 4, 10)
@@ -213,6 +214,17 @@ class Probe:
 
 def rates_of(session: Session) -> tuple[int, ...]:
     """Return the rates to try [Hz], fastest first, the session's own among them."""
-    loop_hz = session.loop.rate_hz
+    loop_hz, most_hz = session.loop.rate_hz, most_measured_hz(session)
     own_hz = round(1e9 / session.send_period_ns)
-    return tuple(sorted({loop_hz // k for k in RATE_DIVISORS} | {own_hz}, reverse=True))
+    tried = {rate for k in RATE_DIVISORS if (rate := loop_hz // k) <= most_hz}
+    return tuple(sorted(tried | {own_hz}, reverse=True))
+
+
+def most_measured_hz(session: Session) -> float:
+    """Return the fastest rate that reaches the other end whole.
+
+    A relay thins packets that come closer together than at its rate, and half a period early must
+    be no loss.
+    """
+    relayed_hz = most_relayed_hz(session)
+    return session.loop.rate_hz if relayed_hz is None else relayed_hz / 2
