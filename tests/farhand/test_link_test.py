@@ -1,12 +1,9 @@
 """`farhand link-test` between two processes on loopback."""
 
 import json
-import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +14,11 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.security.identity import Identity
 from tests.loopback.secured import make_keys, write_session
 from tests.ports import free_port
+from tests.running import farhand, running
 
 pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parents[2]
-DEADLINE_S = 60.0
 
 
 @pytest.fixture
@@ -34,27 +31,8 @@ def session(tmp_path: Path) -> Path:
     return path
 
 
-@contextmanager
-def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=DEADLINE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise
-
-
 def ask(session: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "farhand", "link-test", str(session), *arguments],
-        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False,
-    )  # fmt: skip
+    return farhand("link-test", session, *arguments)
 
 
 def test_both_ends_measure_the_path_and_keep_its_delays(session: Path, tmp_path: Path) -> None:
