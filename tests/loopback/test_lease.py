@@ -1,4 +1,4 @@
-"""One robot, three people with certificates, a relay: who drives, who is told what."""
+"""One robot, three people with certificates, a relay or none: who drives, who is told what."""
 
 import json
 import os
@@ -47,13 +47,21 @@ SILENCE_S = 2.0
 class Robot:
     """A remote site that records, its relay, operators' local sites, and what `list` says."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, routed: bool) -> None:
         self.folder = folder
         self.keys = folder / "keys"
         make_keys(self.keys, PARTIES)
-        self.relay = f"tls/127.0.0.1:{free_port()}"
+        self.routed = routed
+        self.place = f"tls/127.0.0.1:{free_port()}"  # where all meet: the relay, or the robot
+        network = {"router": self.place}
+        if not routed:
+            network = {
+                "remote_listen": self.place,
+                "local_connect": self.place,
+                "local_listen": f"tls/127.0.0.1:{free_port()}",
+            }
         self.file = write_session(
-            folder / "session.toml", self.keys, router=self.relay, operator_silence_s=SILENCE_S
+            folder / "session.toml", self.keys, operator_silence_s=SILENCE_S, **network
         )
         text = self.file.read_text(encoding="utf-8")
         self.file.write_text(
@@ -72,7 +80,9 @@ class Robot:
             )
 
     def start_operator(self, name: str) -> None:
-        self.start(name, "local_site", str(self.file), "--as", name, "--no-record")
+        # each on a machine of his own else, where he listens for dashboards
+        own = () if self.routed else ("--listen", f"tls/127.0.0.1:{free_port()}")
+        self.start(name, "local_site", str(self.file), "--as", name, "--no-record", *own)
 
     def end(self, name: str, number: int = signal.SIGINT) -> None:
         process = self.processes.pop(name)
@@ -105,8 +115,7 @@ class Ear:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        configuration = tls(robot.keys / "dashboard") | {"region_name": "observer"}
-        self._node = ZenohNode(ZenohSettings(connect=(robot.relay,), configuration=configuration))
+        self._node = behind(robot, "dashboard", "observer")
         self._ear = self._node.subscriber(f"farhand/{NAME}/remote/lease", 100)
         self.status: RemoteStatus | None = None
 
@@ -142,11 +151,12 @@ class Ear:
         self._node.close()
 
 
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    robot = Robot(tmp_path)
+@pytest.fixture(params=[True, False], ids=["router", "no router"])
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
+    robot = Robot(tmp_path, routed=request.param)
     try:
-        robot.start("router", "farhand", "router", str(robot.file))
+        if robot.routed:
+            robot.start("router", "farhand", "router", str(robot.file))
         robot.start("remote", "remote_site", str(robot.file))
         yield robot
     finally:
@@ -154,9 +164,11 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 
 
 def behind(robot: Robot, identity: str, region: str = "local") -> ZenohNode:
-    """A node at the relay that enforces nothing itself."""
-    configuration = tls(robot.keys / identity) | {"region_name": region}
-    return ZenohNode(ZenohSettings(connect=(robot.relay,), configuration=configuration))
+    """A node at the relay, or dialling the robot, that enforces nothing itself."""
+    configuration = tls(robot.keys / identity)
+    if robot.routed:
+        configuration["region_name"] = region
+    return ZenohNode(ZenohSettings(connect=(robot.place,), configuration=configuration))
 
 
 def events(robot: Robot) -> list[str]:
@@ -189,7 +201,8 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
 
         # words in another's name, and poses in one's own, do nothing
         with closing(behind(robot, "operator.bob")) as thief:
-            until(lambda: thief.partners() == ("router-1",), "a connection")
+            partner = "router-1" if robot.routed else "remote-1"
+            until(lambda: thief.partners() == (partner,), "a connection")
             claims = thief.publisher(claim_key(NAME, "alice"))
             poses = thief.publisher(state_key(NAME, SiteId.LOCAL, "alice"))
             own = thief.publisher(claim_key(NAME, "bob"))
