@@ -25,6 +25,7 @@ from site_runtime.lease_keeper import LeaseKeeper, rules_of
 from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
+from site_runtime.other_session import OtherSession
 from site_runtime.real_time import RealTimeError, apply_real_time
 from site_runtime.security.network import Meeting, meet_as_site
 from site_runtime.session import Session, SessionError, load_session
@@ -182,6 +183,7 @@ def run_daemon(
             log.about(session.name, surroundings.epoch)
             site = build(session, surroundings)
             lease = _lease(meeting, session, site, surroundings, node, link)
+            other = OtherSession(session, lambda: site.channel.other_session)
             log.say(_greeting(session, site))
             for warning in meeting.warnings:
                 log.say(f"network: {warning}", "WARN")
@@ -199,7 +201,7 @@ def run_daemon(
                 start_recorder(session, site, memory)
                 if options.record
                 else nullcontext() as recorder,
-                _status(site, (recorder, metrics), _shown(lease), log, options),
+                _status(site, (recorder, metrics, other), _shown(lease), log, options),
                 lease,
                 LinkKeeper(site.channel, node, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
@@ -215,7 +217,7 @@ def run_daemon(
                 site.run(signals.asked_to_stop)
                 site.telemetry.farewell(clock.now_ns())
             if log.format is LogFormat.TEXT:
-                summary(site, Console(), recorder)
+                summary(site, Console(), recorder, other.trouble or other.told)
             elif recorder is not None and recorder.trouble is not None:
                 log.say(recorder.trouble, "WARN")
     except (SessionError, LinkError, HardwareError, RealTimeError, TelemetryError) as error:

@@ -12,6 +12,7 @@ from channel.link import Link, LinkError, TappedLink
 from channel.packet import Packet, PacketError, Reject, decode
 from site_runtime.clock import Clock, Pacer
 from site_runtime.keys import SiteId
+from site_runtime.other_session import OtherSession
 from site_runtime.security.network import most_relayed_hz
 from site_runtime.session import Session
 
@@ -101,6 +102,7 @@ class Probe:
             silence_ns=_SILENCE_NS,
             session_start_ns=clock.now_ns(),
         )
+        self._other = OtherSession(session, self._other_digest)
 
     def answer(self, should_stop: Callable[[], bool]) -> None:
         """Send at the rate that the other end wants, until told to stop.
@@ -134,8 +136,8 @@ class Probe:
                 self._send(now_ns, _IDLE_HZ)
             for _, data in self.heard:
                 self._packet(data)
-            if self._channel.session_mismatch:
-                raise LinkTestError("the other end has ANOTHER session file: copy one to the other")
+            if self._other.trouble is not None:
+                raise LinkTestError(f"{self._other.trouble}: copy one file to the other end")
             if self._channel.loop_bound_ns is not None:
                 return True
             if now_ns >= end_ns:
@@ -180,6 +182,10 @@ class Probe:
 
     def _every(self, rate_hz: float) -> int:
         return max(1, round(self._loop_hz / rate_hz))
+
+    def _other_digest(self) -> int | None:
+        digest = self._channel.other_session
+        return None if digest is None else digest ^ _OTHER_DIGEST
 
     def _tap(self, arrived: list[bytes]) -> None:
         now_ns = self._clock.now_ns()

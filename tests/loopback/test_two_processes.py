@@ -4,6 +4,7 @@ All three are on one machine, so all stamps are on one CLOCK_MONOTONIC: what a s
 age of its peer's samples can be held against the peer's own record.
 """
 
+import json
 import re
 import signal
 import subprocess
@@ -390,6 +391,31 @@ def test_another_session_file_never_engages_and_is_told(rig: Rig) -> None:
     for daemon in daemons:
         assert daemon.stop() == 0
         assert "ANOTHER session file" in daemon.text()
+
+
+def test_another_network_profile_is_named_at_both_sites(rig: Rig) -> None:
+    """In the status line, as an event, in JSON too, and in the summary."""
+    profiles = {LOCAL: "lan", REMOTE: "wan"}
+    sessions = {}
+    for site, profile in profiles.items():
+        path = rig.session(profile)
+        text = path.read_text(encoding="utf-8")
+        path.write_text(
+            text.replace("[network]", f'[network]\nprofile = "{profile}"'), encoding="utf-8"
+        )
+        sessions[site] = path
+    local = rig.start(LOCAL, sessions[LOCAL])
+    remote = rig.start(REMOTE, sessions[REMOTE], "--log", "json")
+    there = {
+        LOCAL: '"wan" or "lossy", here it is "lan"',
+        REMOTE: '"lan" or "wifi", here it is "wan"',
+    }
+    rig.until(lambda: there[LOCAL] in local.text(), "the local site tells")
+    in_json = json.dumps(there[REMOTE])[1:-1]
+    rig.until(lambda: in_json in remote.text(), "the remote site tells")
+    assert local.stop() == 0
+    assert local.text().count(there[LOCAL]) >= 2
+    assert remote.stop() == 0
 
 
 def test_a_suspended_site_is_held_for_and_returns_to_fresh_samples(rig: Rig) -> None:
