@@ -182,7 +182,7 @@ def run_daemon(
             )
             log.about(session.name, surroundings.epoch)
             site = build(session, surroundings)
-            lease = _lease(meeting, session, site, surroundings, node, link)
+            lease = _lease(meeting, session, site, surroundings, node, link, log)
             other = OtherSession(session, lambda: site.channel.other_session)
             log.say(_greeting(session, site))
             for warning in meeting.warnings:
@@ -233,6 +233,7 @@ def _lease(
     surroundings: Surroundings,
     node: ZenohNode,
     link: ZenohLink,
+    log: DaemonLog,
 ) -> LeaseKeeper | LeaseClaimant | AbstractContextManager[None]:
     """Return this site's side of the lease; a local site without operators has none."""
     name, epoch = session.name, surroundings.epoch
@@ -247,6 +248,7 @@ def _lease(
             {person: node.subscriber(claim_key(name, person), _WORDS) for person in persons},
             rules_of(session, meeting.people),
             node.publisher(lease_key(name)),
+            log,
         )
     if meeting.person is None:
         return nullcontext()
@@ -256,6 +258,7 @@ def _lease(
         site,
         node.subscriber(lease_key(name), _WORDS),
         node.publisher(claim_key(name, meeting.person)),
+        log,
     )
 
 

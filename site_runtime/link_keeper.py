@@ -36,11 +36,10 @@ class LinkKeeper(Keeper):
     def __init__(
         self, channel: Channel, connection: Connection, clock: Clock, log: DaemonLog
     ) -> None:
-        super().__init__("link", _LOOK_S)
+        super().__init__("link", _LOOK_S, log)
         self._channel = channel
         self._connection = connection
         self._clock = clock
-        self._log = log
         self._refused = 0
         self._patience_s = UNHEARD_S
         self._well_ns = clock.now_ns()
@@ -59,6 +58,9 @@ class LinkKeeper(Keeper):
             self._connection.reopen()
             self._patience_s = min(2.0 * self._patience_s, LONGEST_S)
             self._well_ns = self._clock.now_ns()
+
+    def look_failed(self) -> None:
+        """Leave the link as it is: silence is what stops a site, and it watches that itself."""
 
     def _answered(self, now_ns: int) -> bool:
         channel = self._channel

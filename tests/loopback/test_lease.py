@@ -18,6 +18,7 @@ from site_runtime.lease import Verb, Wish
 from site_runtime.lease_messages import RemoteStatus, decode_status, encode_wish
 from site_runtime.security.identity import Identity
 from telemetry.recorded_runs import recorded_runs, recording_files
+from tests.loopback.remote_that_fails import FAIL
 from tests.loopback.secured import (
     NAME,
     ORPHAN_S,
@@ -153,14 +154,11 @@ class Ear:
 
 @pytest.fixture(params=[True, False], ids=["router", "no router"])
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
-    robot = Robot(tmp_path, routed=request.param)
-    try:
+    with closing(Robot(tmp_path, routed=request.param)) as robot:
         if robot.routed:
             robot.start("router", "farhand", "router", str(robot.file))
         robot.start("remote", "remote_site", str(robot.file))
         yield robot
-    finally:
-        robot.close()
 
 
 def behind(robot: Robot, identity: str, region: str = "local") -> ZenohNode:
@@ -279,3 +277,25 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
     for i, line in enumerate(states):
         if "holds it" in line and "refused" not in line and "gives" not in line:
             assert "READY" in line, (i, states)
+
+
+def test_a_lease_that_cannot_be_kept_is_told_and_ended_and_goes_on(tmp_path: Path) -> None:
+    """The safe side of a surprise: outputs off, then whoever claims it, by the usual way."""
+    with closing(Robot(tmp_path, routed=False)) as robot:
+        robot.start("remote", "tests.loopback.remote_that_fails", str(robot.file))
+        with closing(Ear(robot)) as ear, closing(behind(robot, "operator.alice")) as words:
+            robot.start_operator("alice")
+            say = words.publisher(claim_key(NAME, "alice"))
+            for times in range(1, 3):
+                ear.until("alice", "ENGAGED")
+                say(FAIL)
+                until(
+                    lambda times=times: (
+                        robot.text("remote").count("lease: alice loses it") == times
+                    ),
+                    "the lease ended",
+                )
+            ear.until("alice", "ENGAGED")
+        text = robot.text("remote")
+    assert text.count("keeping the lease failed, and goes on: RuntimeError: words") == 1
+    assert text.count("READY: the lease is over") + text.count("READY: nobody here") >= 2
