@@ -163,10 +163,7 @@ def run_daemon(
         ):
             link = node.link(
                 state_key(session.name, identity, meeting.person),
-                # of several operators none is heard before one holds the lease
-                None
-                if identity is SiteId.REMOTE and meeting.people
-                else state_key(session.name, identity.peer),
+                state_key(session.name, identity.peer, _first_peer(identity, meeting)),
             )
             publish = node.publisher(telemetry_key(session.name, identity, meeting.person))
             if meeting.person is not None:
@@ -203,7 +200,7 @@ def run_daemon(
                 else nullcontext() as recorder,
                 _status(site, (recorder, metrics, other), _shown(lease), log, options),
                 lease,
-                LinkKeeper(site.channel, node, clock, log),
+                LinkKeeper(site, node, link, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -224,6 +221,12 @@ def run_daemon(
         log.say(f"{identity.label} site: {error}", "ERROR")
         return EXIT_NOT_STARTED
     return EXIT_FAULT if site.failure is not None else 0
+
+
+def _first_peer(identity: SiteId, meeting: Meeting) -> str | None:
+    """Return the operator whom the link knows at first; none is heard before he has the lease."""
+    remote_led = identity is SiteId.REMOTE and meeting.people
+    return meeting.people[0].person if remote_led else None
 
 
 def _lease(

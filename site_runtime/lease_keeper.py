@@ -49,7 +49,7 @@ class LeaseKeeper(Keeper):
     """Keeps the lease of one remote site from a thread of its own, in a `with` statement.
 
     `ears` are by operator; without any, whoever comes first is obeyed, and it only tells how the
-    site is. The link must listen to nobody at first.
+    site is.
     """
 
     def __init__(
@@ -79,7 +79,9 @@ class LeaseKeeper(Keeper):
         self._obeyed: str | None = None
         self._deaf_ticks = 0
         self._told_ns: int | None = None
-        site.requests.unleased = bool(ears)
+        if ears:
+            site.requests.unleased = True
+            switch.listen_to(None)
 
     @property
     def lease(self) -> Lease:

@@ -13,21 +13,22 @@ DEADLINE_S = 60.0
 
 
 @contextmanager
-def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+def running(*arguments: str, log: Path | None = None) -> Iterator[subprocess.Popen[bytes]]:
     """Run `python -m ...` until the end of a `with` statement, which interrupts it."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", *arguments],
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    with (log or Path(os.devnull)).open("ab") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *arguments],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+        )
     try:
         yield process
     finally:
         process.send_signal(signal.SIGINT)
         try:
-            process.communicate(timeout=DEADLINE_S)
+            process.wait(timeout=DEADLINE_S)
         except subprocess.TimeoutExpired:
             process.kill()
             raise

@@ -138,6 +138,9 @@ class SecuredPair:
         process.kill()
         process.wait()
 
+    def signal(self, name: str, number: int) -> None:
+        self._processes[name].send_signal(number)
+
     def text(self, name: str) -> str:
         """What it printed."""
         return (self.folder / f"{name}.log").read_text(encoding="utf-8")

@@ -16,6 +16,7 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.keys import SiteId, claim_key, state_key
 from site_runtime.lease import Verb, Wish
 from site_runtime.lease_messages import RemoteStatus, decode_status, encode_wish
+from site_runtime.link_keeper import ASK_S, UNHEARD_S
 from site_runtime.security.identity import Identity
 from telemetry.recorded_runs import recorded_runs, recording_files
 from tests.loopback.remote_that_fails import FAIL
@@ -250,6 +251,9 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
         robot.end("alice", signal.SIGKILL)
         robot.end("bob")
         ear.until(None, "READY")
+        time.sleep(2.5 * (UNHEARD_S + ASK_S))
+        # nobody to hear is no reason to leave the network
+        assert "the connection is opened anew" not in robot.text("remote")
     robot.end("remote")
     told = events(robot)
     expected = [

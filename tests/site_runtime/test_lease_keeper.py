@@ -67,6 +67,8 @@ class Place:
             self.out,
             DaemonLog("remote"),
         )
+        assert self.turned == [None] * bool(self.names), "heard somebody at first"
+        self.turned.clear()
 
     def listen_to(self, peer_key: str | None) -> None:
         if peer_key is not None:
