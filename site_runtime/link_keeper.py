@@ -10,7 +10,7 @@ from site_runtime.site import Site
 UNHEARD_S: Final = 3.0
 """So long must the peer not answer: longer than any round trip of a usable network."""
 
-ASK_S: Final = 1.0
+ASK_S: Final = 2.0
 """So long may whoever is connected take to say whether the peer is there."""
 
 LONGEST_S: Final = 60.0

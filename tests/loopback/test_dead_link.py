@@ -11,11 +11,10 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.keys import lease_key
 from site_runtime.lease_messages import decode_status
 from site_runtime.link_keeper import ASK_S, UNHEARD_S
-from site_runtime.session_edit import edited
 from tests.loopback.deaf_wire import DeafWire
-from tests.loopback.secured import until
+from tests.loopback.secured import NAME, until, write_session
 from tests.ports import free_port
-from tests.running import ROOT, running
+from tests.running import running
 
 pytestmark = pytest.mark.processes
 ABSENT_S = 2.5 * (UNHEARD_S + ASK_S)
@@ -27,10 +26,9 @@ class Wired:
     def __init__(self, folder: Path, *, routed: bool) -> None:
         port = free_port()
         self.wire = DeafWire(port)
-        demo = (ROOT / "experiments" / "demo.toml").read_text(encoding="utf-8")
         self.files = {}
         for name, at in (("router", port), ("remote", port), ("local", self.wire.port)):
-            network = {"router": f"tcp/127.0.0.1:{at}"}
+            network: dict[str, object] = {"router": f"tcp/127.0.0.1:{at}"}
             if not routed:
                 network = {
                     "remote_listen": f"tcp/127.0.0.1:{port}",
@@ -38,10 +36,9 @@ class Wired:
                     "local_listen": f"tcp/127.0.0.1:{free_port()}",
                 }
             # a lease that outlasts a busy machine: no connection is to end by itself
-            changes: dict[str, str | float] = {"name": "dead", "network.lease_s": 10.0}
-            changes |= {f"network.{key}": to for key, to in network.items()}
-            self.files[name] = folder / f"{name}.toml"
-            self.files[name].write_text(edited(demo, changes), encoding="utf-8")
+            self.files[name] = write_session(
+                folder / f"{name}.toml", folder, security="none", **network | {"lease_s": 10.0}
+            )
         self._stack = ExitStack()
         self._node = ZenohNode(
             ZenohSettings(
@@ -49,7 +46,7 @@ class Wired:
                 configuration={"region_name": "observer"} if routed else {},
             )
         )
-        self._ear = self._node.subscriber(lease_key("dead"), 100)
+        self._ear = self._node.subscriber(lease_key(NAME), 100)
         self.said = folder / "local.log"
 
     def run(self, name: str) -> ExitStack:
@@ -102,7 +99,7 @@ def test_an_absent_peer_is_waited_for_on_the_same_connection(routed: Wired) -> N
     time.sleep(ABSENT_S)
     routed.run("remote")
     routed.until_engaged()
-    assert (routed.wire.connections, routed.opened_anew()) == (1, 0)
+    assert (routed.wire.connections, routed.opened_anew()) == (1, 0), routed.said.read_text()
 
 
 @pytest.mark.parametrize("place", ["routed", "direct"])
