@@ -18,11 +18,19 @@ from site_runtime.clock import SteadyClock
 from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals
 from site_runtime.keys import SiteId, state_key
 from site_runtime.link_figures import Figures, Passage, Spread, figures, traces
-from site_runtime.link_test import SETTLE_S, LinkTestError, Phase, Probe, rates_of
+from site_runtime.link_test import (
+    SETTLE_S,
+    LinkTestError,
+    Phase,
+    Probe,
+    most_measured_hz,
+    rates_of,
+)
 from site_runtime.margin import margin_of
 from site_runtime.network_profiles import PROFILES, fitting
 from site_runtime.real_time import apply_real_time
-from site_runtime.security.network import meet_as_site
+from site_runtime.security.identity import SecurityError
+from site_runtime.security.network import BURST, Meeting, meet_as_site
 from site_runtime.session import Session, load_session
 
 EXIT_NOT_COVERED = 1
@@ -49,6 +57,14 @@ def link_test(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
     connect: Connect = None,
     listen: Listen = None,
+    operator: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
+            metavar="NAME",
+            help="The operator at the local site; with --answer, whom to answer.",
+        ),
+    ] = None,
 ) -> None:
     """Measure the network between the sites, in their place: stop them first.
 
@@ -61,21 +77,29 @@ def link_test(
         if save is not None:
             save.mkdir(parents=True, exist_ok=True)
         site = SiteId.REMOTE if answer else SiteId.LOCAL
+        meeting = meet_as_site(loaded, site, listen, connect, None if answer else operator)
+        for warning in meeting.warnings:
+            _tell(f"network: {warning}")
+        person = _whom(meeting, operator) if answer else meeting.person
         clock = SteadyClock()
         cpus = loaded.real_time
         with (
-            closing(_node(loaded, site, listen, connect)) as node,
+            closing(_node(meeting)) as node,
             StopSignals(clock, None) as signals,
             apply_real_time(cpus, cpus.remote_cpu if answer else cpus.local_cpu),
         ):
-            link = node.link(
-                state_key(loaded.name, site), state_key(loaded.name, site.peer), capacity=1024
-            )
+            keys = {
+                SiteId.LOCAL: state_key(loaded.name, SiteId.LOCAL, person),
+                SiteId.REMOTE: state_key(loaded.name, SiteId.REMOTE),
+            }
+            link = node.link(keys[site], keys[site.peer], capacity=1024)
             probe = Probe(loaded, site, link, clock)
             if answer:
                 _tell(f"answering for the {site.label} site until Ctrl-C")
                 probe.answer(signals.asked_to_stop)
                 return
+            if not rate and (most_hz := most_measured_hz(loaded)) < loaded.loop.rate_hz:
+                _tell(f"rates up to {most_hz:g} Hz: the router would thin faster ones")
             phases = _measure(probe, rates, duration, signals)
         if not phases:
             raise typer.Exit(EXIT_NOT_COVERED)
@@ -92,12 +116,18 @@ def link_test(
         raise typer.Exit(EXIT_NOT_COVERED)
 
 
-def _node(
-    session: Session, site: SiteId, listen: Sequence[str] | None, connect: Sequence[str] | None
-) -> ZenohNode:
-    meeting = meet_as_site(session, site, listen, connect)
-    for warning in meeting.warnings:
-        _tell(f"network: {warning}")
+def _whom(meeting: Meeting, operator: str | None) -> str | None:
+    """Return which operator to answer: each has a key of his own, and only it may be heard."""
+    names = [one.person for one in meeting.people]
+    if operator is None and len(names) <= 1:
+        return names[0] if names else None
+    if operator not in names:
+        known = ", ".join(map(str, names)) or "nobody"
+        raise SecurityError(f"--answer: say whom to answer with --as NAME, of {known}")
+    return operator
+
+
+def _node(meeting: Meeting) -> ZenohNode:
     try:
         return ZenohNode(meeting.settings)
     except LinkError as error:
@@ -112,6 +142,14 @@ def _require_rates(session: Session, rates: Sequence[int]) -> None:
             raise LinkTestError(
                 f"--rate {rate_hz} is not allowed: it must divide loop.rate_hz = "
                 f"{session.loop.rate_hz}, a site sends on every k-th tick"
+            )
+        if rate_hz > (most_hz := most_measured_hz(session)):
+            raise LinkTestError(
+                f"--rate {rate_hz} is not allowed: the router lets {2 * most_hz:g} packets a "
+                f"second through, {BURST} times the session's own rate, and drops what comes too "
+                f"soon after another, as if the network had lost it; up to {most_hz:g} Hz nothing "
+                "does. A higher channel.send_rate_hz, in the router's session file too, lets more "
+                "be measured"
             )
 
 

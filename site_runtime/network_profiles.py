@@ -28,7 +28,7 @@ class NetworkProfile:
 
 PROFILES: Final[Mapping[str, NetworkProfile]] = MappingProxyType(
     {
-        "lan": NetworkProfile(0.5, 2.0, None, False, False, 0.01, 0.005, 0.0005),
+        "lan": NetworkProfile(0.5, 1.0, None, False, False, 0.01, 0.005, 0.0005),
         "wifi": NetworkProfile(1.0, 1.0, None, False, True, 0.03, 0.03, 0.02),
         "wan": NetworkProfile(1.0, 2.0, 250, True, False, 0.3, 0.03, 0.003),
         "lossy": NetworkProfile(

@@ -109,6 +109,14 @@ def meet_as_router(session: Session, listen: Sequence[str] | None = None) -> Mee
     return _meet(session, ROUTER, listens, [])
 
 
+def most_relayed_hz(session: Session) -> float | None:
+    """Return how many packets a second of each site the session's relay lets through at most.
+
+    Packets that come closer together are thinned; None without a relay.
+    """
+    return None if session.network.router is None else BURST * 1e9 / session.send_period_ns
+
+
 def keys_folder(session: Session) -> Path:
     """Return the folder of the session's identities: beside the session file unless it says."""
     if session.network.keys is not None:
@@ -270,7 +278,6 @@ def _relay(session: Session, people: Sequence[Identity]) -> Mapping[str, Any]:
     states = [state_key(session.name, *party) for party in parties]
     rows = [telemetry_key(session.name, *party) for party in parties]
     claims = [claim_key(session.name, one) for one in persons]
-    most_hz = BURST * 1e9 / session.send_period_ns
     sizes = [
         ("state", states, MOST_STATE_BYTES),
         ("telemetry", rows, MOST_TELEMETRY_BYTES),
@@ -298,7 +305,7 @@ def _relay(session: Session, people: Sequence[Identity]) -> Mapping[str, Any]:
                 "id": "state-rate",
                 "flows": ["ingress"],
                 "messages": ["put"],
-                "rules": [{"key_expr": key, "freq": most_hz} for key in states],
+                "rules": [{"key_expr": key, "freq": most_relayed_hz(session)} for key in states],
             }
         ],
     }

@@ -12,6 +12,7 @@ pytestmark = [
     pytest.mark.skipif(namespace.refusal() is not None, reason=str(namespace.refusal() or "")),
 ]
 
+LAN = next(network for network in NETWORKS if network.profile == "lan")
 LOSSY = next(network for network in NETWORKS if network.profile == "lossy")
 TRIES = 3  # a machine that stalls makes the sites hold longer than the network does
 
@@ -41,6 +42,22 @@ def test_an_outage_of_a_lossy_network_leads_to_hold_and_back(protocol: str, rout
         if good(seen):
             return
         told.append(f"{seen.ages_ms()} {seen.engaged} {seen.to_hold_s} {seen.to_engaged_s}")
+    pytest.fail("\n".join(told))
+
+
+def test_a_lan_that_was_cut_comes_back_over_udp_before_two_handshakes_have_timed_out() -> None:
+    """The handshake that the outage swallowed must not be waited for as long as on a WAN."""
+    told = []
+    for seed in range(TRIES):
+        try:
+            seen = play(LAN, "udp", 0.5, seed=seed + 1)
+        except NotReached as missed:
+            told.append(str(missed))
+            continue
+        assert not seen.violations, "\n".join(seen.violations)
+        if seen.to_engaged_s < 2.0:
+            return
+        told.append(f"{seen.to_engaged_s} s")
     pytest.fail("\n".join(told))
 
 
