@@ -111,6 +111,8 @@ class Channel:
             direction, mode, session_start_ns=session_start_ns, seed=(seed, site)
         )
         self.counters = Counters()
+        self.longest_way_ns: int | None = None
+        """Of the packets that the last `latest` took in: from stamp to arrival, on two clocks."""
         self._now_ns: int | None = None
         self._newest: Packet | None = None
         self._heard_ns = 0
@@ -132,6 +134,7 @@ class Channel:
         safe, never raises.
         """
         self._now_ns = now_ns
+        self.longest_way_ns = None
         for data in self._link.receive():
             self._arrive(data, now_ns)
         offset_ns = 0 if self._shared_clock else self._clock_offset.offset_ns
@@ -343,6 +346,9 @@ class Channel:
                 return
             self.counters.lost += gap - 1
         self.counters.received += 1
+        way_ns = now_ns - packet.stamp_ns
+        if self.longest_way_ns is None or way_ns > self.longest_way_ns:
+            self.longest_way_ns = way_ns
         self._newest = packet
         self._heard_ns = now_ns
         if packet.echo_epoch == self._epoch:

@@ -74,6 +74,10 @@ class Pacer:
         self._skip((now_ns - self._deadline_ns) // self._period_ns)
         return now_ns - due_ns
 
+    def shift(self, by_ns: int) -> None:
+        """Let all deadlines to come be so much later [ns]; negative: earlier."""
+        self._deadline_ns += by_ns
+
     def _skip(self, ticks: int) -> None:
         self.missed += ticks
         self._deadline_ns += ticks * self._period_ns

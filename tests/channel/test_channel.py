@@ -114,6 +114,19 @@ def test_a_sample_tells_when_it_arrived_however_long_it_has_been_in_use() -> Non
         assert sample.arrival_ns == 7 * MS
 
 
+def test_the_longest_way_is_that_of_the_packets_that_came_with_this_tick() -> None:
+    wire = Wire()
+    assert wire.channel.longest_way_ns is None
+    wire.hear(7 * MS, wire.packet(2), wire.packet(3))
+    assert wire.channel.longest_way_ns == 5 * MS
+    wire.hear(8 * MS)
+    assert wire.channel.longest_way_ns is None
+    wire.hear(8 * MS, wire.packet(1), b"no packet")
+    assert wire.channel.longest_way_ns is None, "what is refused is on no way"
+    wire.hear(9 * MS, wire.packet(50))
+    assert wire.channel.longest_way_ns == -41 * MS, "the clocks need not agree"
+
+
 @pytest.mark.parametrize("mode", ["exact", "added"])
 @pytest.mark.parametrize("shared_clock", [True, False])
 def test_round_trip_is_the_sum_of_the_delays(mode: DelayMode, shared_clock: bool) -> None:

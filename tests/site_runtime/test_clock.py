@@ -39,6 +39,17 @@ def test_lateness_of_one_tick_does_not_move_the_next() -> None:
     assert pacer.missed == 0
 
 
+def test_a_shift_moves_all_deadlines_to_come() -> None:
+    clock = LateClock()
+    pacer = Pacer(clock, PERIOD)
+    pacer.wait()
+    pacer.shift(PERIOD // 4)
+    assert wakes(clock, pacer, 2) == [(2.25, 0), (3.25, 0)]
+    pacer.shift(-PERIOD // 4)
+    assert wakes(clock, pacer, 2) == [(4, 0), (5, 0)]
+    assert pacer.missed == 0
+
+
 def test_a_stall_is_skipped_and_counted_never_caught_up() -> None:
     clock = LateClock([0, 3_500_000, 0])
     pacer = Pacer(clock, PERIOD)

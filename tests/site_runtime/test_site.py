@@ -161,15 +161,25 @@ class Bench:
     events: list[tuple[int, str]]
 
     def __init__(
-        self, *, peer_digest: int = DIGEST, send_every: int = 1, certified_s: float = CERTIFIED_S
+        self,
+        *,
+        peer_digest: int = DIGEST,
+        send_every: int = 1,
+        certified_s: float = CERTIFIED_S,
+        identity: SiteId = SiteId.LOCAL,
+        clock: ManualClock | None = None,
     ) -> None:
-        self.clock, self.journal, self.requests = ManualClock(), Journal(), OperatorRequests()
+        self.clock, self.journal, self.requests = (
+            clock or ManualClock(),
+            Journal(),
+            OperatorRequests(),
+        )
         self.published: list[bytes] = []
         mine, theirs = memory_links()
         self.peer_link: MemoryLink = theirs
-        self.peer = self._channel(Channel, theirs, 1, peer_digest, PEER_EPOCH, 1)
+        self.peer = self._channel(Channel, theirs, identity.peer, peer_digest, PEER_EPOCH, 1)
         self.peer_state, self.peer_position = State.READY, np.array([0.5, 0.25])
-        channel = self._channel(NotedChannel, mine, 0, DIGEST, EPOCH, send_every)
+        channel = self._channel(NotedChannel, mine, identity, DIGEST, EPOCH, send_every)
         telemetry = NotedTelemetry(2, 2, 0, DIGEST, EPOCH, self.published.append, batch_rows=1)
         channel.journal = telemetry.journal = self.journal
         telemetry.events = self.events = []
@@ -200,7 +210,7 @@ class Bench:
         )
         relaxed = np.full(2, 0.5 * certified_s + 1e-3)
         self.site = Site(
-            SiteId.LOCAL,
+            identity,
             device=self.device,
             robot=NotedRobot(self.model, self.journal),  # type: ignore[arg-type]
             channel=channel,
@@ -229,14 +239,20 @@ class Bench:
             session_start_ns=0,
         )
 
+    def speak(self) -> None:
+        """Let the peer listen and speak."""
+        now_ns, rest = self.clock.now_ns(), np.zeros(2)
+        self.peer.latest(now_ns)
+        self.peer.send(now_ns, self.peer_state, self.peer_position, rest, rest)
+
     def tick(self, count: int = 1, *, peer_speaks: bool = True, lateness_ns: int = 7) -> list[str]:
         """Let a millisecond pass, the peer speak, the site tick; return what its tick called."""
         for _ in range(count):
             self.clock.sleep_until_ns(self.clock.now_ns() + MS)
-            self.peer.latest(self.clock.now_ns())
             if peer_speaks:
-                rest = np.zeros(2)
-                self.peer.send(self.clock.now_ns(), self.peer_state, self.peer_position, rest, rest)
+                self.speak()
+            else:
+                self.peer.latest(self.clock.now_ns())
             before = len(self.journal.calls)
             self.site.tick(lateness_ns)
         return self.journal.calls[before:]
@@ -619,6 +635,39 @@ def test_run_ticks_at_its_period_publishes_and_ends_cleanly() -> None:
     assert rows["stamp_ns"].tolist() == [k * MS for k in range(1, 11)]
     assert bench.site.lateness.percentiles_us(100) == (0.0,)
     assert bench.journal.calls[-1] == "close"
+
+
+class PeerClock(ManualClock):
+    """Lets `speak` happen once a millisecond, `phase_ns` after it began, while others sleep."""
+
+    def __init__(self, phase_ns: int) -> None:
+        super().__init__()
+        self._next_ns = phase_ns
+        self.speak: Callable[[], None] = lambda: None
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        while self._next_ns <= deadline_ns:
+            super().sleep_until_ns(self._next_ns)
+            self._next_ns += MS
+            self.speak()
+        super().sleep_until_ns(deadline_ns)
+
+
+@pytest.mark.parametrize("phase_us", [50, 350, 650, 950])
+@pytest.mark.parametrize("identity", list(SiteId))
+def test_of_two_loops_the_remote_one_finds_the_moment_after_the_others_packets(
+    identity: SiteId, phase_us: int
+) -> None:
+    clock = PeerClock(phase_us * 1000)
+    bench = Bench(identity=identity, clock=clock)
+    clock.speak = bench.speak
+    bench.site.run(stop_after(2000))
+    rows = bench.site.telemetry.last(500)
+    waited_ns = np.median(rows["stamp_ns"] - rows["used_stamp_ns"])
+    if identity is SiteId.REMOTE:
+        assert waited_ns < 0.05 * MS
+    else:
+        assert waited_ns == MS - phase_us * 1000
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt(), SystemExit(1)])
