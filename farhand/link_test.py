@@ -1,8 +1,9 @@
 """`farhand link-test`."""
 
 import json
-from collections.abc import Callable, Sequence
-from contextlib import closing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
@@ -11,22 +12,25 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from channel.link import LinkError
+from channel.link import Link, LinkError
 from channel.zenoh_link import ZenohNode
 from farhand.console import ERR, OUT, say, user_errors
 from site_runtime.clock import SteadyClock
-from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals
+from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals, packets_node
 from site_runtime.keys import SiteId, state_key
 from site_runtime.link_figures import Figures, Passage, Spread, figures, traces
 from site_runtime.link_test import SETTLE_S, LinkTestError, Phase, Probe, rates_of
 from site_runtime.margin import margin_of
 from site_runtime.network_profiles import PROFILES, fitting
+from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import apply_real_time
+from site_runtime.seal_keeper import SealKeeper
 from site_runtime.security.network import meet_as_site
 from site_runtime.session import Session, load_session
 
 EXIT_NOT_COVERED = 1
 TRACES = ("local_to_remote.csv", "remote_to_local.csv")
+_CAPACITY = 1024
 _MARGIN = 1.1  # of the certificate over the longest loop that was seen
 
 
@@ -64,13 +68,10 @@ def link_test(
         clock = SteadyClock()
         cpus = loaded.real_time
         with (
-            closing(_node(loaded, site, listen, connect)) as node,
+            _link(loaded, site, listen, connect, clock) as link,
             StopSignals(clock, None) as signals,
             apply_real_time(cpus, cpus.remote_cpu if answer else cpus.local_cpu),
         ):
-            link = node.link(
-                state_key(loaded.name, site), state_key(loaded.name, site.peer), capacity=1024
-            )
             probe = Probe(loaded, site, link, clock)
             if answer:
                 _tell(f"answering for the {site.label} site until Ctrl-C")
@@ -92,18 +93,43 @@ def link_test(
         raise typer.Exit(EXIT_NOT_COVERED)
 
 
-def _node(
-    session: Session, site: SiteId, listen: Sequence[str] | None, connect: Sequence[str] | None
-) -> ZenohNode:
+@contextmanager
+def _link(
+    session: Session,
+    site: SiteId,
+    listen: Sequence[str] | None,
+    connect: Sequence[str] | None,
+    clock: SteadyClock,
+) -> Iterator[Link]:
+    """Stand in a site's place: where its packets go, sealed if they are."""
     meeting = meet_as_site(session, site, listen, connect)
     for warning in meeting.warnings:
         _tell(f"network: {warning}")
-    try:
-        return ZenohNode(meeting.settings)
-    except LinkError as error:
-        raise LinkTestError(
-            f"{error}. If a site, or another link test, runs on this machine, stop it first"
-        ) from error
+    with ExitStack() as stack:
+        try:
+            node = stack.enter_context(closing(ZenohNode(meeting.settings)))
+            packets = stack.enter_context(packets_node(meeting))
+        except LinkError as error:
+            raise LinkTestError(
+                f"{error}. If a site, or another link test, runs on this machine, stop it first"
+            ) from error
+        if packets is None:
+            keys = state_key(session.name, site), state_key(session.name, site.peer)
+            yield node.link(*keys, capacity=_CAPACITY)
+            return
+        sealing = SealKeeper(
+            session,
+            site,
+            meeting,
+            time.time_ns(),
+            node,
+            packets,
+            clock,
+            OperatorRequests(),
+            lambda text, _: _tell(text),
+            _CAPACITY,
+        )
+        yield stack.enter_context(sealing).link
 
 
 def _require_rates(session: Session, rates: Sequence[int]) -> None:
@@ -202,7 +228,8 @@ def _print(session: Session, measured: Sequence[Figures], own: Figures, certifie
 
 
 def _protocol(name: str) -> str:
-    return ", udp/ or quic/ endpoints" if PROFILES[name].loss_tolerant else ""
+    tolerant = PROFILES[name].loss_tolerant
+    return ", udp/ or quic/ endpoints, or packets_connect" if tolerant else ""
 
 
 def _ms(spread: Spread) -> str:

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from channel.link import LinkError
+from channel.sealed_link import SealedLink
 from channel.zenoh_link import ZenohLink, ZenohNode
 from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
@@ -21,11 +22,12 @@ from site_runtime.daemon_log import DaemonLog, LogFormat
 from site_runtime.flight_recorder import start_recorder
 from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
 from site_runtime.lease_claimant import LeaseClaimant
-from site_runtime.lease_keeper import LeaseKeeper, rules_of
+from site_runtime.lease_keeper import LeaseKeeper, Switch, rules_of
 from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
+from site_runtime.seal_keeper import SealedLinkKeeper, SealKeeper
 from site_runtime.security.network import Meeting, meet_as_site
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
@@ -156,17 +158,28 @@ def run_daemon(
         clock = SteadyClock()
         requests = OperatorRequests()
         shares_rows = options.record or options.metrics is not None
+        epoch = time.time_ns()
         with (
             closing(ZenohNode(meeting.settings)) as node,
+            packets_node(meeting) as packets,
             closing(SharedMemory()) as memory,
         ):
-            link = node.link(
-                state_key(session.name, identity, meeting.person),
-                # of several operators none is heard before one holds the lease
-                None
-                if identity is SiteId.REMOTE and meeting.people
-                else state_key(session.name, identity.peer),
-            )
+            link: ZenohLink | SealedLink
+            switch: Switch
+            if packets is None:
+                sealing = None
+                link = switch = node.link(
+                    state_key(session.name, identity, meeting.person),
+                    # of several operators none is heard before one holds the lease
+                    None
+                    if identity is SiteId.REMOTE and meeting.people
+                    else state_key(session.name, identity.peer),
+                )
+            else:
+                sealing = switch = SealKeeper(
+                    session, identity, meeting, epoch, node, packets, clock, requests, log.say
+                )
+                link = sealing.link
             publish = node.publisher(telemetry_key(session.name, identity, meeting.person))
             if meeting.person is not None:
                 publish = _while_leased(requests, publish)
@@ -174,14 +187,14 @@ def run_daemon(
                 link=link,
                 clock=clock,
                 session_start_ns=clock.now_ns(),
-                epoch=time.time_ns(),
+                epoch=epoch,
                 publish=publish,
                 requests=requests,
                 allocate=memory.allocate if shares_rows else bytearray,
             )
-            log.about(session.name, surroundings.epoch)
+            log.about(session.name, epoch)
             site = build(session, surroundings)
-            lease = _lease(meeting, session, site, surroundings, node, link)
+            lease = _lease(meeting, session, site, surroundings, node, switch)
             log.say(_greeting(session, site))
             for warning in meeting.warnings:
                 log.say(f"network: {warning}", "WARN")
@@ -201,7 +214,10 @@ def run_daemon(
                 else nullcontext() as recorder,
                 _status(site, (recorder, metrics), _shown(lease), log, options),
                 lease,
-                LinkKeeper(site.channel, node, clock, log),
+                nullcontext() if sealing is None else sealing,
+                LinkKeeper(site.channel, node, clock, log)
+                if sealing is None
+                else SealedLinkKeeper(site.channel, sealing, clock, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -224,13 +240,18 @@ def run_daemon(
     return EXIT_FAULT if site.failure is not None else 0
 
 
+def packets_node(meeting: Meeting) -> AbstractContextManager[ZenohNode | None]:
+    """Open the node for sealed packets, if the session has them."""
+    return nullcontext() if meeting.packets is None else closing(ZenohNode(meeting.packets))
+
+
 def _lease(
     meeting: Meeting,
     session: Session,
     site: Site,
     surroundings: Surroundings,
     node: ZenohNode,
-    link: ZenohLink,
+    switch: Switch,
 ) -> LeaseKeeper | LeaseClaimant | AbstractContextManager[None]:
     """Return this site's side of the lease; a local site without operators has none."""
     name, epoch = session.name, surroundings.epoch
@@ -241,7 +262,7 @@ def _lease(
             site,
             epoch,
             surroundings.clock,
-            link,
+            switch,
             {person: node.subscriber(claim_key(name, person), _WORDS) for person in persons},
             rules_of(session, meeting.people),
             node.publisher(lease_key(name)),

@@ -31,8 +31,8 @@ FORGED = b"forged"
 FORGED_S = 0.8
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
+def free_port(kind: int = socket.SOCK_STREAM) -> int:
+    with socket.socket(type=kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
@@ -94,7 +94,7 @@ def tls(folder: Path | None, trust: Path | None = None) -> dict[str, object]:
 class SecuredPair:
     """Both daemons, with a relay or without, and a dashboard's feed."""
 
-    def __init__(self, folder: Path, relay: str | None = None) -> None:
+    def __init__(self, folder: Path, relay: str | None = None, sealed: bool = False) -> None:
         self.folder = folder
         self.keys = folder / "keys"
         self.authority = make_keys(self.keys)
@@ -108,6 +108,9 @@ class SecuredPair:
         if relay is not None:
             self.relay = f"{relay}/127.0.0.1:{free_port()}"
             network = {"router": self.relay}
+        if sealed:
+            self.packets = f"udp/127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
+            network |= {"packets_listen": self.packets, "packets_connect": self.packets}
         self.file = write_session(folder / "session.toml", self.keys, **network)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._feed: Feed | None = None
