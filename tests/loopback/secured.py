@@ -180,6 +180,10 @@ class SecuredPair:
         for batch, _ in self._feed.receive():
             self._newest[SiteId(batch.site)] = batch.rows
 
+    def state(self, site: SiteId) -> State:
+        """The state of a site by the newest row that came."""
+        return State(self._newest[site]["state"][-1])
+
     def rejected(self, site: SiteId) -> int:
         """How many packets a site has refused, by rows made from now on."""
         asked_ns = time.monotonic_ns()

@@ -47,13 +47,17 @@ SILENCE_S = 2.0
 class Robot:
     """A remote site that records, its relay, operators' local sites, and what `list` says."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **network: object) -> None:
         self.folder = folder
         self.keys = folder / "keys"
         make_keys(self.keys, PARTIES)
         self.relay = f"tls/127.0.0.1:{free_port()}"
         self.file = write_session(
-            folder / "session.toml", self.keys, router=self.relay, operator_silence_s=SILENCE_S
+            folder / "session.toml",
+            self.keys,
+            router=self.relay,
+            operator_silence_s=SILENCE_S,
+            **network,
         )
         text = self.file.read_text(encoding="utf-8")
         self.file.write_text(

@@ -1,10 +1,15 @@
 """Packets over plain UDP, sealed end to end: two daemons, and all who reach the port."""
 
+import json
+import select
 import shutil
 import socket
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from struct import pack
 
@@ -25,10 +30,12 @@ from site_runtime.security.identity import Identity
 from site_runtime.security.network import Meeting, meet_as_site
 from site_runtime.security.offer import OwnOffer
 from site_runtime.session import load_session
+from site_runtime.supervisor import State
 from tests.loopback.secured import (
     FORGED,
     LOOPBACK,
     NAME,
+    ROOT,
     SecuredPair,
     free_port,
     make_keys,
@@ -36,6 +43,7 @@ from tests.loopback.secured import (
     until,
     write_session,
 )
+from tests.loopback.test_lease import Ear, Robot
 
 pytestmark = pytest.mark.processes
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
@@ -243,6 +251,143 @@ def test_who_comes_by_udp_hears_and_says_nothing_but_packets(relayed: SecuredPai
         assert FORGED not in leases
         heard = {key for ear in by_udp for key, _ in ear.receive()}
         assert heard <= {state_key(NAME, LOCAL)}  # which `farhand/**` hears with the control
+
+
+class Wire:
+    """UDP between two ports, which can be cut."""
+
+    def __init__(self, to_port: int) -> None:
+        self._to = ("127.0.0.1", to_port)
+        self._near = socket.socket(type=socket.SOCK_DGRAM)
+        self._near.bind(("127.0.0.1", 0))
+        self._far: dict[tuple[str, int], socket.socket] = {}
+        self.place = f"udp/127.0.0.1:{self._near.getsockname()[1]}"
+        self.cut = False
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        while not self._over.is_set():
+            far = {one: client for client, one in self._far.items()}
+            ready, _, _ = select.select([self._near, *far], [], [], 0.1)
+            for one in ready:
+                try:
+                    data, sender = one.recvfrom(65535)
+                except OSError:  # nobody is there
+                    continue
+                if one is self._near and sender not in self._far:
+                    self._far[sender] = socket.socket(type=socket.SOCK_DGRAM)
+                    self._far[sender].connect(self._to)
+                if self.cut:
+                    continue
+                with suppress(OSError):
+                    if one is self._near:
+                        self._far[sender].send(data)
+                    else:
+                        self._near.sendto(data, far[one])
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        for one in (self._near, *self._far.values()):
+            one.close()
+
+
+def test_an_outage_of_udp_alone_leads_to_hold_and_back(tmp_path: Path) -> None:
+    pair = SecuredPair(tmp_path, sealed=True)
+    with closing(Wire(int(pair.packets.rpartition(":")[2]))) as wire, closing(pair):
+        text = pair.file.read_text(encoding="utf-8")
+        changed = text.replace(
+            f'packets_connect = "{pair.packets}"', f'packets_connect = "{wire.place}"'
+        )
+        assert changed != text
+        pair.file.write_text(changed, encoding="utf-8")
+        pair.start("remote", "local")
+        pair.watch()
+        pair.until_engaged()
+        for outage_s in (2.0, 8.0):  # longer than a lease; than it takes to open the link anew
+            wire.cut = True
+            time.sleep(outage_s)
+            pair.update()
+            # telemetry, by the certificates, goes on
+            assert {pair.state(site) for site in SiteId} <= {State.HOLD, State.READY}
+            wire.cut = False
+            pair.until_engaged()
+        assert "nothing that remote-1 has sealed arrives" in pair.text("local")
+
+
+def test_a_relay_that_was_killed_is_replaced_and_the_pair_engages_again(
+    relayed: SecuredPair,
+) -> None:
+    """First by what two zenohds would be told."""
+    files = []
+    for option in ("--print-config", "--print-packets-config"):
+        command = [sys.executable, "-m", "farhand", "router", str(relayed.file), option]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert json.loads(done.stdout)["access_control"]["default_permission"] == "deny"
+        files.append(relayed.folder / f"zenohd{option}.json5")
+        files[-1].write_text(done.stdout, encoding="utf-8")
+    relayed.kill("router")
+    with ExitStack() as stack:
+        nodes = [
+            stack.enter_context(closing(ZenohNode(ZenohSettings(config_file=str(file)))))
+            for file in files
+        ]
+        until(lambda: {"local-1", "remote-1"} <= set(nodes[0].partners()), "both at the relay")
+        until(lambda: len(nodes[1].partners()) == 2, "their packets there too")
+        relayed.until_engaged()
+    relayed.start("router")
+    relayed.until_engaged()
+
+
+def test_a_link_test_goes_where_the_sites_packets_go(tmp_path: Path) -> None:
+    pair = SecuredPair(tmp_path, sealed=True)
+    words = [sys.executable, "-m", "farhand", "link-test", str(pair.file), "--rate", "250"]
+    with closing(pair), (tmp_path / "answer.log").open("ab") as log:
+        answer = subprocess.Popen([*words, "--answer"], cwd=ROOT, stdout=log, stderr=log)
+        try:
+            done = subprocess.run(
+                [*words, "--json", "--duration", "2"],
+                cwd=ROOT,
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=False,
+            )
+        finally:
+            answer.terminate()
+            answer.wait(30)
+        assert "packets are sealed with remote-1" in done.stderr, done
+        assert "packets are sealed with local-1" in (tmp_path / "answer.log").read_text()
+        (rate,) = json.loads(done.stdout)["rates"]
+        assert 0.0 < rate["round_trip"]["p50_s"] < 5.0
+
+
+def test_the_lease_goes_from_hand_to_hand_and_the_seal_with_it(tmp_path: Path) -> None:
+    packets = f"udp/127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
+    with closing(Robot(tmp_path, packets_listen=packets, packets_connect=packets)) as robot:
+        robot.start("router", "farhand", "router", str(robot.file))
+        robot.start("remote", "remote_site", str(robot.file))
+        with closing(Ear(robot)) as ear:
+            robot.start_operator("alice")
+            ear.until("alice", "ENGAGED")
+            robot.start_operator("bob")
+            until(lambda: "refused, alice holds it" in robot.text("bob"), "bob told")
+            give = ("lease", "give", str(robot.file), "bob", "--as", "alice")
+            assert robot.farhand(*give) == (0, "given to bob\n")
+            ear.until("bob", "ENGAGED")
+            robot.end("bob")
+            ear.until("alice", "ENGAGED")
+        seals = [line for line in robot.text("remote").splitlines() if "packets are" in line]
+        assert [line.partition("packets are sealed with ")[2] for line in seals] == [
+            "operator.alice-1",
+            "operator.bob-1",
+            "operator.alice-1",
+        ]
+        for name in ("alice", "bob"):  # who waits is not told of packets that are for others
+            assert "refused: " not in robot.text(name).replace("lease: refused", "")
+            assert "opened anew" not in robot.text(name)
 
 
 class Relay:
