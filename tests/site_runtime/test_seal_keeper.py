@@ -2,19 +2,23 @@
 
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from channel.packet import Reject
 from channel.sealed_link import Refusal
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.clock import ManualClock
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keys import SiteId, state_key
 from site_runtime.operator_requests import OperatorRequests
-from site_runtime.seal_keeper import WARN_NS, SealKeeper
+from site_runtime.seal_keeper import WARN_NS, SealedLinkKeeper, SealKeeper
 from site_runtime.security.authority import Authority
 from site_runtime.security.identity import SITES, Identity
 from site_runtime.security.network import meet_as_site
@@ -276,3 +280,58 @@ def test_who_waits_for_the_lease_is_not_told_of_packets_for_others(tmp_path: Pat
         place.until(
             lambda: any("under no key in use" in text for text in bob.warnings()), "the other"
         )
+
+
+def test_either_node_s_silence_has_both_opened_anew_but_not_while_others_hold_the_robot(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remote, local = place.end(REMOTE), place.end(LOCAL)
+    place.until_hears(local, remote, b"back")
+    opened_s: list[float] = []
+    monkeypatch.setattr(local.seal, "reopen", lambda: opened_s.append(place.clock.now_ns() / S))
+    channel = SimpleNamespace(
+        counters=SimpleNamespace(rejected=Counter[Reject]()),
+        heard_ns=None,
+        echoed_ns=None,
+        peer_taken=False,
+    )
+    keeper = SealedLinkKeeper(channel, local.seal, place.clock, DaemonLog("local"))  # type: ignore[arg-type]
+
+    def opened(*, echoes: bool, offers: bool = True) -> int:
+        """Let ten seconds pass; how often was it opened anew?"""
+        opened_s.clear()
+        for _ in range(40):
+            if offers:
+                place.look()
+                time.sleep(0.01)
+            else:
+                place.clock.sleep_until_ns(place.clock.now_ns() + S // 4)
+            if echoes:
+                channel.echoed_ns = place.clock.now_ns()
+            keeper.look()
+        return len(opened_s)
+
+    assert opened(echoes=True) == 0
+    assert opened(echoes=True, offers=False) > 0  # telemetry and the lease would be dead
+    assert opened(echoes=True) == 0
+    assert opened(echoes=False) > 0
+    local.requests.unleased = True
+    opened(echoes=False)
+    assert opened(echoes=False) == 0
+    assert opened(echoes=False, offers=False) > 0
+    local.requests.unleased = False
+    opened(echoes=True)
+    remote.packets.close()
+    until(lambda: not local.packets.dialled(), "gone")
+    assert opened(echoes=False) == 0  # an outage is waited out
+
+
+def test_both_nodes_are_opened_anew_and_packets_flow_again(place: Place) -> None:
+    remote, local = place.end(REMOTE), place.end(LOCAL)
+    place.until_hears(remote, local, b"before")
+    partners = {node: set(node.partners()) for node in (remote.node, remote.packets)}
+    local.seal.reopen()
+    place.until(lambda: local.seal.dialled(), "both connected")
+    place.until_hears(remote, local, b"after")
+    place.until_hears(local, remote, b"and back")
+    assert set(remote.packets.partners()) != partners[remote.packets]  # from another port
