@@ -3,6 +3,7 @@ import struct
 import threading
 
 import pytest
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,7 +48,16 @@ def test_what_is_sealed_is_opened_and_cannot_be_read_on_the_way(datagrams: list[
 
 def test_the_same_twice_looks_different() -> None:
     one, other = sealed(bytes(100), bytes(100))
-    assert one[-100:] != other[-100:]
+    assert one[13:-16] != other[13:-16]
+
+
+def test_a_datagram_is_what_the_docs_say() -> None:
+    """Version, key id, sequence; then the packet and a tag, all of them under the tag."""
+    _, datagram = sealed(b"one", b"a pose")
+    head = bytes([1]) + THERE[:4] + bytes(7) + b"\2"
+    assert datagram[:13] == head
+    cipher = ChaCha20Poly1305(THERE[4:])
+    assert cipher.decrypt(bytes(11) + b"\2", datagram[13:], head) == b"a pose"
 
 
 @given(st.binary(min_size=1, max_size=150), st.data())
