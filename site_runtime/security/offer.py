@@ -47,7 +47,6 @@ class OfferError(SecurityError):
 class Offer:
     """A peer's, checked: the key of one of its runs, until its certificate expires."""
 
-    epoch: int
     public: bytes
     expires: datetime
     signed: bytes
@@ -103,7 +102,7 @@ class OfferReader:
         """Return the offer if it is of `common_name`, now, for this session; else OfferError."""
         if not _HEAD.size < len(payload) <= MOST_OFFER_BYTES:
             raise OfferError(f"is no offer: it has {len(payload)} bytes")
-        version, digest, epoch, public, length = _HEAD.unpack_from(payload)
+        version, digest, _, public, length = _HEAD.unpack_from(payload)
         end = _HEAD.size + length
         if version != _VERSION:
             raise OfferError(f"is of version {version}, not {_VERSION}")
@@ -130,7 +129,7 @@ class OfferReader:
             raise OfferError("is not signed by its certificate's key") from None
         if digest != self._digest:
             raise OfferError("is for another session file")
-        return Offer(epoch, public, expires, payload[:end])
+        return Offer(public, expires, payload[:end])
 
 
 def _hash(data: bytes) -> bytes:

@@ -149,7 +149,7 @@ def test_a_key_that_makes_no_secret_is_refused(authority: Authority) -> None:
     local, remote = offer(authority, "local"), offer(authority, "remote")
     read = reader(authority).read(local.payload, "local-1")
     for low in (bytes(32), b"\1" + bytes(31)):
-        bad = type(read)(read.epoch, low, read.expires, read.signed)
+        bad = type(read)(low, read.expires, read.signed)
         with pytest.raises(OfferError, match="none"):
             remote.keys_with(bad)
 
