@@ -253,6 +253,31 @@ def test_who_comes_by_udp_hears_and_says_nothing_but_packets(relayed: SecuredPai
         assert heard <= {state_key(NAME, LOCAL)}  # which `farhand/**` hears with the control
 
 
+def test_a_flood_of_forged_packets_through_the_relay_is_thinned_and_refused(
+    relayed: SecuredPair,
+) -> None:
+    relayed.until_engaged()
+    before = relayed.text("remote")
+    over = threading.Event()
+    with closing(at_the_port(relayed.packets)) as node:
+        say = node.publisher(state_key(NAME, LOCAL))
+        until(lambda: bool(node.partners()), "a connection")
+
+        def flood() -> None:
+            while not over.wait(0.005):
+                for _ in range(50):
+                    say(bytes([1]) + bytes(180))
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            until(lambda: refused(relayed, Refusal.KEY, before), "told")
+            relayed.until_engaged()
+        finally:
+            over.set()
+            thread.join()
+
+
 class Wire:
     """UDP between two ports, which can be cut."""
 

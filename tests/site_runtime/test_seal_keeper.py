@@ -235,7 +235,9 @@ def test_a_peer_that_seals_nothing_is_told_of(place: Place) -> None:
     assert "local-1 is connected and offers no key" in remote.warnings()[0]
 
 
-def test_of_several_people_who_holds_the_robot_has_the_packets(tmp_path: Path) -> None:
+def test_of_several_people_who_holds_the_robot_has_the_packets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with closing(Place(tmp_path, "operator.alice", "operator.bob")) as place:
         remote = place.end(REMOTE)
         people = {name: place.end(LOCAL, name) for name in ("alice", "bob")}
@@ -243,6 +245,13 @@ def test_of_several_people_who_holds_the_robot_has_the_packets(tmp_path: Path) -
         assert remote.link.keys is None
         assert not remote.link.send(b"for nobody")
         kept = None
+        while_turning = []
+        turn = remote.seal._link.listen_to
+        monkeypatch.setattr(
+            remote.seal._link,
+            "listen_to",
+            lambda key: (while_turning.append(remote.link.keys), turn(key)),
+        )
         for name in ("alice", "bob", "alice"):
             remote.seal.listen_to(state_key(NAME, LOCAL, name))
             other = "bob" if name == "alice" else "alice"
@@ -255,6 +264,7 @@ def test_of_several_people_who_holds_the_robot_has_the_packets(tmp_path: Path) -
             kept = remote.link.keys if kept is None else kept
         assert remote.link.keys is kept  # with the memory of what it has opened
         remote.seal.listen_to(None)
+        assert while_turning == [None] * 4  # else it may go on speaking to the one before
         assert not remote.link.send(b"for nobody")
 
 
