@@ -11,6 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from channel.link import LinkError
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from farhand.console import ERR, OUT, say, user_errors
 from farhand.demo import SESSION
@@ -46,6 +47,8 @@ from site_runtime.session import LocalSettings, RemoteSettings, Session, load_se
 from telemetry.dashboard import free_port
 
 EXIT_CANNOT = 1
+_BY_KEYS = "a doctor has no keys, and meets nobody at a relay"
+_LINK_TEST = "farhand link-test SESSION.toml measures the way, --answer on the other machine"
 _COLOURS = {
     Verdict.GOOD: "green",
     Verdict.WILL_DO: "yellow",
@@ -175,6 +178,8 @@ def _bent(session: Session, site: SiteId) -> SimulatedSettings:
 
 
 def _round_trip(session: Session, seconds: float) -> Finding:
+    if _meet_by_keys(session):
+        return Finding("round trip", Verdict.NOT_MEASURED, _BY_KEYS, _LINK_TEST)
     endpoint = session.network.local_connect
     asks, answers = doctor_keys(session.name)
     settings = ZenohSettings(connect=(endpoint,), config_file=session.network.zenoh_config)
@@ -183,7 +188,14 @@ def _round_trip(session: Session, seconds: float) -> Finding:
     return round_trip_finding(trips, endpoint, margin_of(session).certified_s, session.period_ns)
 
 
+def _meet_by_keys(session: Session) -> bool:
+    """Whether the sites meet where a doctor, who has no keys, is let in by nobody."""
+    return session.network.security != "none" or session.network.router is not None
+
+
 def _answer(session: Session) -> None:
+    if _meet_by_keys(session):
+        raise LinkError(f"{_BY_KEYS}: {_LINK_TEST}")
     endpoint = session.network.remote_listen
     asks, answers = doctor_keys(session.name)
     settings = ZenohSettings(listen=(endpoint,), config_file=session.network.zenoh_config)

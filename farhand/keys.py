@@ -54,6 +54,7 @@ keys = typer.Typer(
     name="keys",
     cls=_MakesByDefault,
     no_args_is_help=True,
+    add_completion=False,
     help="Certificates of a session's parties: SESSION.toml makes them; renew, revoke, show.",
 )
 

@@ -25,6 +25,7 @@ _CAPACITY = 100
 lease = typer.Typer(
     name="lease",
     no_args_is_help=True,
+    add_completion=False,
     help="The lease of a session's remote robot: show, claim, release, give, take.",
 )
 

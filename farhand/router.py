@@ -13,6 +13,7 @@ from site_runtime.clock import SteadyClock
 from site_runtime.daemon import Duration, Listen, SessionPath, StopSignals, packets_node
 from site_runtime.keys import SiteId, state_key
 from site_runtime.security.network import meet_as_router
+from site_runtime.service_manager import ServiceManager
 from site_runtime.session import SessionError, load_session
 
 POLL_S = 0.2
@@ -55,6 +56,7 @@ def router(
         with (
             closing(ZenohNode(meeting.settings)) as node,
             packets_node(meeting) as packets,
+            closing(ServiceManager()) as manager,
             StopSignals(SteadyClock(), duration) as signals,
         ):
             _say(
@@ -71,7 +73,9 @@ def router(
                 )
                 for site, person in parties
             ]
-            _watch(node, heard, signals)
+            manager.ready()
+            _watch(node, heard, signals, manager)
+            manager.stopping()
 
 
 class _Rate:
@@ -91,7 +95,9 @@ class _Rate:
         return f"{self._name} {rate_hz:.0f} packets/s"
 
 
-def _watch(node: ZenohNode, heard: Sequence[_Rate], signals: StopSignals) -> None:
+def _watch(
+    node: ZenohNode, heard: Sequence[_Rate], signals: StopSignals, manager: ServiceManager
+) -> None:
     """Say who comes and goes, and now and then how much passes."""
     present: tuple[str, ...] = ()
     since_s = time.monotonic()
@@ -99,6 +105,7 @@ def _watch(node: ZenohNode, heard: Sequence[_Rate], signals: StopSignals) -> Non
         for rate in heard:
             rate.poll()
         now = node.partners()
+        manager.alive()
         for name in sorted({*now} - {*present}):
             _say(f"{name} connected")
         for name in sorted({*present} - {*now}):

@@ -29,6 +29,7 @@ from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import RealTimeError, apply_real_time
 from site_runtime.seal_keeper import SealedLinkKeeper, SealKeeper
 from site_runtime.security.network import Meeting, meet_as_site
+from site_runtime.service_manager import ServiceKeeper, ServiceManager
 from site_runtime.session import Session, SessionError, load_session
 from site_runtime.site import Site
 from site_runtime.site_events import Companion, SiteEvents
@@ -163,6 +164,7 @@ def run_daemon(
             closing(ZenohNode(meeting.settings)) as node,
             packets_node(meeting) as packets,
             closing(SharedMemory()) as memory,
+            closing(ServiceManager()) as manager,
         ):
             link: ZenohLink | SealedLink
             switch: Switch
@@ -218,6 +220,7 @@ def run_daemon(
                 LinkKeeper(site.channel, node, clock, log)
                 if sealing is None
                 else SealedLinkKeeper(site.channel, sealing, clock, log),
+                _service_keeper(manager, site),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -276,6 +279,12 @@ def _lease(
         node.subscriber(lease_key(name), _WORDS),
         node.publisher(claim_key(name, meeting.person)),
     )
+
+
+def _service_keeper(
+    manager: ServiceManager, site: Site
+) -> ServiceKeeper | AbstractContextManager[None]:
+    return ServiceKeeper(manager, lambda: site.ticks) if manager.listens else nullcontext()
 
 
 def _while_leased(

@@ -9,16 +9,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from farhand.__main__ import app
+from farhand.__main__ import COMMANDS, app
 
 ROOT = Path(__file__).parents[1]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PACKAGES = PYPROJECT["tool"]["importlinter"]["root_packages"]
-COMMANDS = [
-    command.name or command.callback.__name__.replace("_", "-")
-    for command in app.registered_commands
-    if command.callback
-] + [group.typer_instance.info.name for group in app.registered_groups if group.typer_instance]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -54,6 +49,18 @@ def test_every_command_explains_itself(command: str) -> None:
     result = CliRunner().invoke(app, [command, "--help"])
     assert result.exit_code == 0, result.output
     assert "Usage" in result.output
+
+
+def test_a_site_has_neither_viewer_nor_benchmarks_in_its_memory() -> None:
+    look = (
+        "import sys; from farhand.__main__ import app; "
+        "app(['remote', '--help'], standalone_mode=False); "
+        "print(*sorted({'rerun', 'experiments', 'telemetry.dashboard'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", look], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1].strip() == ""
 
 
 @pytest.mark.parametrize("module", ["farhand", "local_site", "remote_site"])

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from control_law.sub_tasks.chain import JointPull, center_3d
-from control_law.sub_tasks.obstacle_distance import closest_parameter
 from control_law.terms import Terms
 
 FloatArray = npt.NDArray[np.float64]
@@ -51,7 +50,7 @@ class SegmentAvoidance:
         points = terms.origins.tolist()
         for i, ((ax, ay, az), (bx, by, bz)) in enumerate(pairwise(points)):
             lx, ly, lz = bx - ax, by - ay, bz - az
-            along = closest_parameter(ax - cx, ay - cy, az - cz, lx, ly, lz)
+            along = _closest_parameter(ax - cx, ay - cy, az - cz, lx, ly, lz)
             x, y, z = ax + along * lx, ay + along * ly, az + along * lz
             ox, oy, oz = x - cx, y - cy, z - cz
             distance2 = ox * ox + oy * oy + oz * oz + core2
@@ -83,3 +82,12 @@ class SegmentAvoidance:
                 ),
             )
         return joint_pull.result()
+
+
+def _closest_parameter(sx: float, sy: float, sz: float, lx: float, ly: float, lz: float) -> float:
+    """Return λ in [0, 1] that brings s + λl nearest to 0: s a link's start from a centre, l it."""
+    length2 = lx * lx + ly * ly + lz * lz
+    if length2 == 0.0:  # two joint centres may coincide
+        return 0.0
+    along = -(lx * sx + ly * sy + lz * sz) / length2
+    return 0.0 if along <= 0.0 else min(along, 1.0)

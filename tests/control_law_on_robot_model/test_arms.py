@@ -15,10 +15,10 @@ from control_law.sub_tasks.joint_limits import JointCentring
 from control_law.sub_tasks.linear import LinearSingularityAvoidance
 from control_law.sub_tasks.manipulability import ManipulabilityAscent
 from control_law.sub_tasks.obstacle import SegmentAvoidance
-from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
 from control_law.sub_tasks.paper_obstacle import StipanovicAvoidance
 from control_law.sub_tasks.sub_task import SubTask
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
+from tests.control_law.chain_distance import midpoint_distance, segment_distance
 
 FloatArray = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[2]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from channel.delay import SinusoidDelay
-from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
 from experiments.simulation import Simulation
 from site_runtime.certification import certify, sampling_ratio
 from site_runtime.derived import derivation
 from site_runtime.keys import SiteId
 from site_runtime.parts import robot_of
 from site_runtime.session import HumanArmOperator, SessionFileError, load_session, parse_session
+from tests.control_law.chain_distance import midpoint_distance, segment_distance
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 FILES = sorted(FOLDER.glob("*.toml"))

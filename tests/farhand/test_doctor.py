@@ -80,6 +80,28 @@ def test_two_doctors_measure_the_way_between_them(tmp_path: Path) -> None:
     assert other.returncode == 0
 
 
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"security": "mtls", "keys": "keys", "local_connect": "tls/127.0.0.1:1"},
+        {"router": "tcp/127.0.0.1:1"},
+    ],
+)
+def test_where_a_doctor_is_let_in_by_nobody_the_link_test_is_named(
+    tmp_path: Path, network: dict[str, str]
+) -> None:
+    file = tmp_path / "session.toml"
+    demo = load_session(EXPERIMENTS / "demo.toml")
+    changes = {f"network.{key}": value for key, value in network.items()}
+    file.write_text(edited(demo.text, changes), encoding="utf-8")
+    found = doctor_module._round_trip(load_session(file), 0.1)
+    assert found.verdict is Verdict.NOT_MEASURED
+    assert "link-test" in found.change
+    answering = CliRunner().invoke(app, ["doctor", str(file), "--answer"])
+    assert answering.exit_code == 2
+    assert "link-test" in answering.output
+
+
 def test_the_exit_code_and_the_table_tell_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [
         Finding("kernel", Verdict.WILL_DO, "[old]", "a newer one"),

@@ -40,8 +40,8 @@ def refusal() -> str | None:
 
 def create(name: str) -> None:
     """Make a namespace with its loopback up; CalledProcessError if refused."""
-    _ip("netns", "add", name)
-    _ip("-n", name, "link", "set", "lo", "up")
+    ip("netns", "add", name)
+    ip("-n", name, "link", "set", "lo", "up")
 
 
 def delete(name: str) -> None:
@@ -70,10 +70,10 @@ def open_tun(name: str, device: str, address: str) -> int:
         descriptor = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK)
         request = struct.pack("16sH22x", device.encode(), _IFF_TUN | _IFF_NO_PI)
         fcntl.ioctl(descriptor, _TUNSETIFF, request)
-    _ip("-n", name, "address", "add", address, "dev", device)
+    ip("-n", name, "address", "add", address, "dev", device)
     # no IPv6 of its own: its discovery packets would come in between ours
-    _ip("-n", name, "link", "set", device, "addrgenmode", "none")
-    _ip("-n", name, "link", "set", device, "up")
+    ip("-n", name, "link", "set", device, "addrgenmode", "none")
+    ip("-n", name, "link", "set", device, "up")
     return descriptor
 
 
@@ -85,5 +85,6 @@ def _enter(descriptor: int) -> None:
         raise OSError(code, os.strerror(code))
 
 
-def _ip(*arguments: str) -> None:
+def ip(*arguments: str) -> None:
+    """Run `ip`; CalledProcessError with what it said if it refuses."""
     subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)  # noqa: S607

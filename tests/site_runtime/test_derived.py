@@ -8,15 +8,16 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from control_law.null_space import manipulability
-from control_law.sub_tasks.obstacle_distance import midpoint_distance, segment_distance
 from hardware.robot_model import PlanarArm, RobotModel, UrdfArm, build_robot
 from site_runtime.derived import ArmRows, derivation, distance_rows, manipulability_rows
 from site_runtime.keys import SiteId
 from site_runtime.parts import robot_of
 from site_runtime.session import load_session
 from telemetry.rows import DERIVED
+from tests.control_law.chain_distance import midpoint_distance, segment_distance
 
 FloatArray = npt.NDArray[np.float64]
 ROOT = Path(__file__).parents[2]
@@ -68,7 +69,32 @@ def test_every_row_has_the_distances_of_the_control_law(
     links_m, midpoints_m = distance_rows(np.stack(chains, axis=2), np.array(centers_m))
     for found, measure in ((links_m, segment_distance), (midpoints_m, midpoint_distance)):
         expected = [min(measure(c, np.array(centre)) for centre in centers_m) for c in chains]
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7)  # a root of a difference
+        np.testing.assert_allclose(found, expected, **TO_ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("center", "link", "midpoint"),
+    [([0.5, 0.3], 0.3, 0.3), ([-0.3, 0.4], 0.5, np.hypot(0.8, 0.4)), ([1.2, 0.5], 0.2, 0.2),
+     ([1.3, -0.4], 0.5, np.hypot(0.8, 0.4)), ([1.0, 0.0], 0.0, 0.5)],
+)  # fmt: skip
+def test_distances_in_known_places(center: list[float], link: float, midpoint: float) -> None:
+    elbow = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    found = distance_rows(elbow[:, :, np.newaxis], np.array([[*center, 0.0]]))
+    np.testing.assert_allclose(np.ravel(found), [link, midpoint], **TO_ROUNDING)
+
+
+@given(
+    arrays(np.float64, (4, 3), elements=st.floats(-1, 1)),
+    arrays(np.float64, 3, elements=st.floats(-1, 1)),
+)
+def test_no_point_of_the_chain_is_nearer(origins: FloatArray, center: FloatArray) -> None:
+    grid = np.linspace(0, 1, 101)[:, None, None]
+    points = origins[:-1] + grid * np.diff(origins, axis=0)
+    nearest = np.linalg.norm(points - center, axis=-1).min()
+    link, midpoint = np.ravel(distance_rows(origins[:, :, np.newaxis], center[np.newaxis]))
+    assert link <= nearest + 1e-12
+    assert link >= nearest - 0.02  # half a grid step of the longest link
+    assert link <= midpoint + 1e-12
 
 
 @pytest.mark.parametrize("file", ["demo.toml", "seven_dof.toml"])

@@ -315,7 +315,7 @@ static void *serve(void *unused) {
 static HDSchedulerHandle schedule(Callback call, void *data, HDushort priority, int once) {
     pthread_mutex_lock(&lock);
     HDSchedulerHandle handle = 0;
-    if (task_count < TASKS) {
+    if (task_count < (int)TASKS) {
         int at = task_count++; /* highest priority first */
         for (; at > 0 && tasks[at - 1].priority < priority; at--) tasks[at] = tasks[at - 1];
         tasks[at] = (struct task){handle = next_handle++, call, data, priority, once, 0};
