@@ -115,6 +115,7 @@ class Channel:
         self._newest: Packet | None = None
         self._heard_ns = 0
         self._mismatch_ns: int | None = None
+        self._other_session = session_digest
         self._replaced: set[int] = set()
         self._used_stamp_ns = NO_STAMP
         self._greatest_age = GreatestAge()
@@ -260,11 +261,12 @@ class Channel:
         return self._link.peer_present()
 
     @property
-    def session_mismatch(self) -> bool:
-        """Whether a peer with another session file was heard within the last second."""
+    def other_session(self) -> int | None:
+        """Digest of a peer's session file that is not mine, if heard within the last second."""
         if self._mismatch_ns is None or self._now_ns is None:
-            return False
-        return self._now_ns - self._mismatch_ns < _MISMATCH_SHOWN_NS
+            return None
+        shown = self._now_ns - self._mismatch_ns < _MISMATCH_SHOWN_NS
+        return self._other_session if shown else None
 
     @property
     def offset(self) -> OffsetEstimate | None:
@@ -304,6 +306,7 @@ class Channel:
             return Reject.SITE
         if packet.session != self._session:
             self._mismatch_ns = now_ns
+            self._other_session = packet.session
             return Reject.SESSION
         if packet.position_m.size != self._dimension:
             return Reject.DIMENSION

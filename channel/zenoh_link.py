@@ -71,6 +71,7 @@ class ZenohLink:
     ) -> None:
         self._own_key = own_key
         self._peer_key = peer_key
+        self._asked_key = peer_key
         self._capacity = capacity
         self._closed = False
         self._present: set[str] = set()
@@ -94,6 +95,7 @@ class ZenohLink:
         """
         with self._declaring:
             self._peer_key = peer_key
+            self._asked_key = peer_key or self._asked_key
             before = [self._subscriber, self._presence]
             self._subscriber = self._presence = None
             _bounded(*(one.undeclare for one in before if one is not None))
@@ -154,6 +156,29 @@ class ZenohLink:
             else:
                 self._present.discard(run)
         return bool(self._present)
+
+    def ask_for_peer(self, within_s: float) -> bool | None:
+        """Ask the other ends of the connections whether they know of the peer: a question and back.
+
+        None if not all have answered within the time. Asks for the last peer while listening to
+        none, and answers False while there was none. Not for the loop: it waits.
+        """
+        if self._closed or self._asked_key is None:
+            return False
+        known = False
+        try:
+            replies = self._session.liveliness().get(
+                f"{self._asked_key}/{_PRESENCE}/*",
+                handler=zenoh.handlers.FifoChannel(64),
+                timeout=within_s,
+            )
+            for reply in replies:
+                if reply.err is not None:  # "Timeout"
+                    return None
+                known = True
+        except zenoh.ZError:  # closed meanwhile
+            return None
+        return known
 
     def close(self) -> None:
         """Leave the link; the node stays open."""

@@ -17,15 +17,24 @@ from channel.zenoh_link import ZenohNode
 from farhand.console import ERR, OUT, say, user_errors
 from site_runtime.clock import SteadyClock
 from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals, packets_node
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keys import SiteId, state_key
 from site_runtime.link_figures import Figures, Passage, Spread, figures, traces
-from site_runtime.link_test import SETTLE_S, LinkTestError, Phase, Probe, rates_of
+from site_runtime.link_test import (
+    SETTLE_S,
+    LinkTestError,
+    Phase,
+    Probe,
+    most_measured_hz,
+    rates_of,
+)
 from site_runtime.margin import margin_of
 from site_runtime.network_profiles import PROFILES, fitting
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import apply_real_time
 from site_runtime.seal_keeper import SealKeeper
-from site_runtime.security.network import meet_as_site
+from site_runtime.security.identity import SecurityError
+from site_runtime.security.network import BURST, Meeting, meet_as_site
 from site_runtime.session import Session, load_session
 
 EXIT_NOT_COVERED = 1
@@ -53,6 +62,14 @@ def link_test(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
     connect: Connect = None,
     listen: Listen = None,
+    operator: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
+            metavar="NAME",
+            help="The operator at the local site; with --answer, whom to answer.",
+        ),
+    ] = None,
 ) -> None:
     """Measure the network between the sites, in their place: stop them first.
 
@@ -65,10 +82,14 @@ def link_test(
         if save is not None:
             save.mkdir(parents=True, exist_ok=True)
         site = SiteId.REMOTE if answer else SiteId.LOCAL
+        meeting = meet_as_site(loaded, site, listen, connect, None if answer else operator)
+        for warning in meeting.warnings:
+            _tell(f"network: {warning}")
+        person = _whom(meeting, operator) if answer else meeting.person
         clock = SteadyClock()
         cpus = loaded.real_time
         with (
-            _link(loaded, site, listen, connect, clock) as link,
+            _link(loaded, site, meeting, person, clock) as link,
             StopSignals(clock, None) as signals,
             apply_real_time(cpus, cpus.remote_cpu if answer else cpus.local_cpu),
         ):
@@ -77,6 +98,8 @@ def link_test(
                 _tell(f"answering for the {site.label} site until Ctrl-C")
                 probe.answer(signals.asked_to_stop)
                 return
+            if not rate and (most_hz := most_measured_hz(loaded)) < loaded.loop.rate_hz:
+                _tell(f"rates up to {most_hz:g} Hz: the router would thin faster ones")
             phases = _measure(probe, rates, duration, signals)
         if not phases:
             raise typer.Exit(EXIT_NOT_COVERED)
@@ -93,18 +116,26 @@ def link_test(
         raise typer.Exit(EXIT_NOT_COVERED)
 
 
+def _whom(meeting: Meeting, operator: str | None) -> str | None:
+    """Return which operator to answer: each has a key of his own, and only it may be heard."""
+    names = [one.person for one in meeting.people]
+    if operator is None and len(names) <= 1:
+        return names[0] if names else None
+    if operator not in names:
+        known = ", ".join(map(str, names)) or "nobody"
+        raise SecurityError(f"--answer: say whom to answer with --as NAME, of {known}")
+    return operator
+
+
 @contextmanager
 def _link(
-    session: Session,
-    site: SiteId,
-    listen: Sequence[str] | None,
-    connect: Sequence[str] | None,
-    clock: SteadyClock,
+    session: Session, site: SiteId, meeting: Meeting, person: str | None, clock: SteadyClock
 ) -> Iterator[Link]:
     """Stand in a site's place: where its packets go, sealed if they are."""
-    meeting = meet_as_site(session, site, listen, connect)
-    for warning in meeting.warnings:
-        _tell(f"network: {warning}")
+    keys = {
+        SiteId.LOCAL: state_key(session.name, SiteId.LOCAL, person),
+        SiteId.REMOTE: state_key(session.name, SiteId.REMOTE),
+    }
     with ExitStack() as stack:
         try:
             node = stack.enter_context(closing(ZenohNode(meeting.settings)))
@@ -114,8 +145,7 @@ def _link(
                 f"{error}. If a site, or another link test, runs on this machine, stop it first"
             ) from error
         if packets is None:
-            keys = state_key(session.name, site), state_key(session.name, site.peer)
-            yield node.link(*keys, capacity=_CAPACITY)
+            yield node.link(keys[site], keys[site.peer], capacity=_CAPACITY)
             return
         sealing = SealKeeper(
             session,
@@ -126,9 +156,10 @@ def _link(
             packets,
             clock,
             OperatorRequests(),
-            lambda text, _: _tell(text),
+            DaemonLog(site.label),
             _CAPACITY,
         )
+        sealing.listen_to(keys[site.peer])
         yield stack.enter_context(sealing).link
 
 
@@ -138,6 +169,14 @@ def _require_rates(session: Session, rates: Sequence[int]) -> None:
             raise LinkTestError(
                 f"--rate {rate_hz} is not allowed: it must divide loop.rate_hz = "
                 f"{session.loop.rate_hz}, a site sends on every k-th tick"
+            )
+        if rate_hz > (most_hz := most_measured_hz(session)):
+            raise LinkTestError(
+                f"--rate {rate_hz} is not allowed: the router lets {2 * most_hz:g} packets a "
+                f"second through, {BURST} times the session's own rate, and drops what comes too "
+                f"soon after another, as if the network had lost it; up to {most_hz:g} Hz nothing "
+                "does. A higher channel.send_rate_hz, in the router's session file too, lets more "
+                "be measured"
             )
 
 

@@ -26,6 +26,7 @@ from site_runtime.lease_keeper import LeaseKeeper, Switch, rules_of
 from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
+from site_runtime.other_session import OtherSession
 from site_runtime.real_time import RealTimeError, apply_real_time
 from site_runtime.seal_keeper import SealedLinkKeeper, SealKeeper
 from site_runtime.security.network import Meeting, meet_as_site
@@ -167,19 +168,16 @@ def run_daemon(
             closing(ServiceManager()) as manager,
         ):
             link: ZenohLink | SealedLink
-            switch: Switch
+            switch: ZenohLink | SealKeeper
             if packets is None:
                 sealing = None
                 link = switch = node.link(
                     state_key(session.name, identity, meeting.person),
-                    # of several operators none is heard before one holds the lease
-                    None
-                    if identity is SiteId.REMOTE and meeting.people
-                    else state_key(session.name, identity.peer),
+                    state_key(session.name, identity.peer, _first_peer(identity, meeting)),
                 )
             else:
                 sealing = switch = SealKeeper(
-                    session, identity, meeting, epoch, node, packets, clock, requests, log.say
+                    session, identity, meeting, epoch, node, packets, clock, requests, log
                 )
                 link = sealing.link
             publish = node.publisher(telemetry_key(session.name, identity, meeting.person))
@@ -196,7 +194,8 @@ def run_daemon(
             )
             log.about(session.name, epoch)
             site = build(session, surroundings)
-            lease = _lease(meeting, session, site, surroundings, node, switch)
+            lease = _lease(meeting, session, site, surroundings, node, switch, log)
+            other = OtherSession(session, lambda: site.channel.other_session)
             log.say(_greeting(session, site))
             for warning in meeting.warnings:
                 log.say(f"network: {warning}", "WARN")
@@ -214,13 +213,13 @@ def run_daemon(
                 start_recorder(session, site, memory)
                 if options.record
                 else nullcontext() as recorder,
-                _status(site, (recorder, metrics), _shown(lease), log, options),
+                _status(site, (recorder, metrics, other), _shown(lease), log, options),
                 lease,
                 nullcontext() if sealing is None else sealing,
-                LinkKeeper(site.channel, node, clock, log)
+                LinkKeeper(site, node, switch, clock, log)
                 if sealing is None
-                else SealedLinkKeeper(site.channel, sealing, clock, log),
-                _service_keeper(manager, site),
+                else SealedLinkKeeper(site, sealing, clock, log),
+                _service_keeper(manager, site, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
                 if recorder is not None:
@@ -234,7 +233,7 @@ def run_daemon(
                 site.run(signals.asked_to_stop)
                 site.telemetry.farewell(clock.now_ns())
             if log.format is LogFormat.TEXT:
-                summary(site, Console(), recorder)
+                summary(site, Console(), recorder, other.trouble or other.told)
             elif recorder is not None and recorder.trouble is not None:
                 log.say(recorder.trouble, "WARN")
     except (SessionError, LinkError, HardwareError, RealTimeError, TelemetryError) as error:
@@ -248,6 +247,12 @@ def packets_node(meeting: Meeting) -> AbstractContextManager[ZenohNode | None]:
     return nullcontext() if meeting.packets is None else closing(ZenohNode(meeting.packets))
 
 
+def _first_peer(identity: SiteId, meeting: Meeting) -> str | None:
+    """Return the operator whom the link knows at first; none is heard before he has the lease."""
+    remote_led = identity is SiteId.REMOTE and meeting.people
+    return meeting.people[0].person if remote_led else None
+
+
 def _lease(
     meeting: Meeting,
     session: Session,
@@ -255,6 +260,7 @@ def _lease(
     surroundings: Surroundings,
     node: ZenohNode,
     switch: Switch,
+    log: DaemonLog,
 ) -> LeaseKeeper | LeaseClaimant | AbstractContextManager[None]:
     """Return this site's side of the lease; a local site without operators has none."""
     name, epoch = session.name, surroundings.epoch
@@ -269,6 +275,7 @@ def _lease(
             {person: node.subscriber(claim_key(name, person), _WORDS) for person in persons},
             rules_of(session, meeting.people),
             node.publisher(lease_key(name)),
+            log,
         )
     if meeting.person is None:
         return nullcontext()
@@ -278,13 +285,14 @@ def _lease(
         site,
         node.subscriber(lease_key(name), _WORDS),
         node.publisher(claim_key(name, meeting.person)),
+        log,
     )
 
 
 def _service_keeper(
-    manager: ServiceManager, site: Site
+    manager: ServiceManager, site: Site, log: DaemonLog
 ) -> ServiceKeeper | AbstractContextManager[None]:
-    return ServiceKeeper(manager, lambda: site.ticks) if manager.listens else nullcontext()
+    return ServiceKeeper(manager, lambda: site.ticks, log) if manager.listens else nullcontext()
 
 
 def _while_leased(

@@ -143,6 +143,13 @@ def look(
     return Step(given, (f"{heir} holds it",))
 
 
+def revoke(lease: Lease, reason: str) -> Step:
+    """Return the lease taken from whoever holds it, by nobody's wish."""
+    if lease.obeyed is None:
+        return Step(lease)
+    return Step(replace(lease, ending=True), (f"{lease.obeyed} loses it: {reason}",))
+
+
 def _claim(lease: Lease, name: str, epoch: int, now_ns: int) -> Step:
     if epoch <= lease.rested.get(name, 0):
         return Step(lease, answer="withdrawn", granted=False)

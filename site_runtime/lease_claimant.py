@@ -5,6 +5,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Final
 
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keeper import Keeper
 from site_runtime.lease import Verb, Wish
 from site_runtime.lease_keeper import Ear
@@ -25,9 +26,15 @@ class LeaseClaimant(Keeper):
     """
 
     def __init__(
-        self, person: str, epoch: int, site: Site, ear: Ear, publish: Callable[[bytes], None]
+        self,
+        person: str,
+        epoch: int,
+        site: Site,
+        ear: Ear,
+        publish: Callable[[bytes], None],
+        log: DaemonLog,
     ) -> None:
-        super().__init__("lease", CLAIM_S)
+        super().__init__("lease", CLAIM_S, log)
         self._person = person
         self._epoch = epoch
         self._site = site
@@ -72,6 +79,12 @@ class LeaseClaimant(Keeper):
             self._tell(self._trouble_in(told[-1]))
         elif time.monotonic() - self._heard_s > _SILENT_S:
             self._tell("lease: the remote site tells nothing of it")
+
+    def look_failed(self) -> None:
+        """Drive no more until the remote is heard to say that this operator may."""
+        self._holds = False
+        self._site.requests.unleased = True
+        self._tell("lease: not known, as looking at it failed")
 
     def _trouble_in(self, status: RemoteStatus) -> str | None:
         if self._holds:

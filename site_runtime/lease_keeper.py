@@ -6,9 +6,10 @@ from typing import Final, Protocol
 
 from site_runtime.assembly import TAKEOVER_NS
 from site_runtime.clock import Clock
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keeper import Keeper
 from site_runtime.keys import SiteId, state_key
-from site_runtime.lease import Lease, LeaseRules, Step, Verb, hear, look
+from site_runtime.lease import Lease, LeaseRules, Step, Verb, hear, look, revoke
 from site_runtime.lease_messages import Answer, RemoteStatus, decode_wish, encode_status
 from site_runtime.security.identity import Identity, Role
 from site_runtime.session import Session
@@ -48,7 +49,7 @@ class LeaseKeeper(Keeper):
     """Keeps the lease of one remote site from a thread of its own, in a `with` statement.
 
     `ears` are by operator; without any, whoever comes first is obeyed, and it only tells how the
-    site is. The link must listen to nobody at first.
+    site is.
     """
 
     def __init__(
@@ -61,8 +62,9 @@ class LeaseKeeper(Keeper):
         ears: Mapping[str, Ear],
         rules: LeaseRules,
         publish: Callable[[bytes], None],
+        log: DaemonLog,
     ) -> None:
-        super().__init__("lease", LOOK_S)
+        super().__init__("lease", LOOK_S, log)
         self._session = session
         self._site = site
         self._epoch = epoch
@@ -77,7 +79,9 @@ class LeaseKeeper(Keeper):
         self._obeyed: str | None = None
         self._deaf_ticks = 0
         self._told_ns: int | None = None
-        site.requests.unleased = bool(ears)
+        if ears:
+            site.requests.unleased = True
+            switch.listen_to(None)
 
     @property
     def lease(self) -> Lease:
@@ -112,6 +116,12 @@ class LeaseKeeper(Keeper):
         if changed or self._told_ns is None or now_ns - self._told_ns >= TELL_NS:
             self._told_ns = now_ns
             self._publish(encode_status(self.status(now_ns)))
+
+    def look_failed(self) -> None:
+        """Obey nobody until looks succeed: the lease ends, as a release would end it."""
+        if self._ears:
+            self._site.requests.unleased = True
+            self._take_in(revoke(self._lease, "it could not be kept"))
 
     def status(self, now_ns: int) -> RemoteStatus:
         """Return what people are told."""

@@ -12,6 +12,8 @@ from channel.link import Link, LinkError, TappedLink
 from channel.packet import Packet, PacketError, Reject, decode
 from site_runtime.clock import Clock, Pacer
 from site_runtime.keys import SiteId
+from site_runtime.other_session import OtherSession
+from site_runtime.security.network import most_relayed_hz
 from site_runtime.session import Session
 
 RATE_DIVISORS: Final = (1, 2, 4, 10)
@@ -100,6 +102,7 @@ class Probe:
             silence_ns=_SILENCE_NS,
             session_start_ns=clock.now_ns(),
         )
+        self._other = OtherSession(session, self._other_digest)
 
     def answer(self, should_stop: Callable[[], bool]) -> None:
         """Send at the rate that the other end wants, until told to stop.
@@ -133,8 +136,8 @@ class Probe:
                 self._send(now_ns, _IDLE_HZ)
             for _, data in self.heard:
                 self._packet(data)
-            if self._channel.session_mismatch:
-                raise LinkTestError("the other end has ANOTHER session file: copy one to the other")
+            if self._other.trouble is not None:
+                raise LinkTestError(f"{self._other.trouble}: copy one file to the other end")
             if self._channel.loop_bound_ns is not None:
                 return True
             if now_ns >= end_ns:
@@ -180,6 +183,10 @@ class Probe:
     def _every(self, rate_hz: float) -> int:
         return max(1, round(self._loop_hz / rate_hz))
 
+    def _other_digest(self) -> int | None:
+        digest = self._channel.other_session
+        return None if digest is None else digest ^ _OTHER_DIGEST
+
     def _tap(self, arrived: list[bytes]) -> None:
         now_ns = self._clock.now_ns()
         self.heard += [(now_ns, data) for data in arrived]
@@ -213,6 +220,17 @@ class Probe:
 
 def rates_of(session: Session) -> tuple[int, ...]:
     """Return the rates to try [Hz], fastest first, the session's own among them."""
-    loop_hz = session.loop.rate_hz
+    loop_hz, most_hz = session.loop.rate_hz, most_measured_hz(session)
     own_hz = round(1e9 / session.send_period_ns)
-    return tuple(sorted({loop_hz // k for k in RATE_DIVISORS} | {own_hz}, reverse=True))
+    tried = {rate for k in RATE_DIVISORS if (rate := loop_hz // k) <= most_hz}
+    return tuple(sorted(tried | {own_hz}, reverse=True))
+
+
+def most_measured_hz(session: Session) -> float:
+    """Return the fastest rate that reaches the other end whole.
+
+    A relay thins packets that come closer together than at its rate, and half a period early must
+    be no loss.
+    """
+    relayed_hz = most_relayed_hz(session)
+    return session.loop.rate_hz if relayed_hz is None else relayed_hz / 2

@@ -2,12 +2,10 @@
 
 import threading
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Final, TypeAlias
+from typing import Final
 
-from channel.channel import Channel
 from channel.sealed_link import PacketKeys, Refusal, SealedLink
 from channel.zenoh_link import Subscription, ZenohNode
 from site_runtime.assembly import TAKEOVER_NS
@@ -21,7 +19,7 @@ from site_runtime.security.identity import SITES, SecurityError
 from site_runtime.security.network import Meeting
 from site_runtime.security.offer import Offer, OfferError, OfferReader, OwnOffer
 from site_runtime.session import Session
-from telemetry.events import Level
+from site_runtime.site import Site
 
 LOOK_S: Final = 0.25
 WARN_NS: Final = 10_000_000_000
@@ -30,8 +28,6 @@ WARN_NS: Final = 10_000_000_000
 _OFFERS = 4  # read in one look: each costs a third of a millisecond of the interpreter
 _AGAIN_NS = 10_000_000_000  # until an offer that was refused is looked at again
 _SETTLE_NS = 3_000_000_000  # in which two runs come to use the same keys
-
-Say: TypeAlias = Callable[[str, Level], None]
 
 
 @dataclass(slots=True)
@@ -70,11 +66,11 @@ class SealKeeper(Keeper):
         packets: ZenohNode,
         clock: Clock,
         requests: OperatorRequests,
-        say: Say,
+        log: DaemonLog,
         capacity: int = 64,
     ) -> None:
         """Offers go by `node`, sealed packets by `packets`. SecurityError without certificates."""
-        super().__init__("seal", LOOK_S)
+        super().__init__("seal", LOOK_S, log)
         credentials = meeting.credentials
         if credentials is None:
             raise SecurityError("packets are sealed between certificates, and here are none")
@@ -82,7 +78,6 @@ class SealKeeper(Keeper):
         self._packets = packets
         self._clock = clock
         self._requests = requests
-        self._say = say
         self._own = OwnOffer(site, credentials, session.digest, epoch)
         self._reader = OfferReader(credentials, session.digest)
         self._offer = node.publisher(offer_key(session.name, site, meeting.person))
@@ -101,7 +96,12 @@ class SealKeeper(Keeper):
         self._link = packets.link(
             state_key(session.name, site, meeting.person), self._turned, capacity
         )
-        self.link = SealedLink(self._link, self.peer_heard)
+        # carries no packet: who is there, by certificates
+        self._presence = node.link(
+            state_key(session.name, site, meeting.person),
+            state_key(session.name, site.peer, people[0].person if people else None),
+        )
+        self.link = SealedLink(self._link, self._presence.peer_present)
         self._opened = 0
         self._opened_ns: int | None = None
         self._changed_ns = clock.now_ns()
@@ -115,6 +115,7 @@ class SealKeeper(Keeper):
             self._turned = peer_key
             self.link.use(None)
             self._link.listen_to(peer_key)
+            self._presence.listen_to(peer_key)
             self._apply(self._clock.now_ns())
 
     def peer_heard(self) -> bool:
@@ -124,6 +125,10 @@ class SealKeeper(Keeper):
             one.heard_ns is not None and now_ns - one.heard_ns < UNHEARD_S * 1e9
             for one in self._peers.values()
         )
+
+    def ask_for_peer(self, within_s: float) -> bool | None:
+        """Ask whoever is connected, with certificates, whether the peer is there."""
+        return self._presence.ask_for_peer(within_s)
 
     @property
     def waits(self) -> bool:
@@ -153,12 +158,16 @@ class SealKeeper(Keeper):
             for _, payload in peer.ear.receive()[-_OFFERS:]:
                 self._take(peer, payload, now_ns, in_use=key == self._turned)
             if peer.offer is not None and datetime.now(UTC) >= peer.offer.expires:
-                self._say(f"the certificate {peer.name} has expired: its packets end", "WARN")
+                self._log.say(f"the certificate {peer.name} has expired: its packets end", "WARN")
                 peer.payload, peer.offer, peer.keys = b"", None, None
         with self._turning:
             self._apply(now_ns)
         self._tell_refused(now_ns)
         self._tell_silence(now_ns)
+
+    def look_failed(self) -> None:
+        """Use no keys until looks succeed: nobody knows whether they are still good."""
+        self.link.use(None)
 
     def _take(self, peer: _Peer, payload: bytes, now_ns: int, *, in_use: bool) -> None:
         if payload == peer.payload:
@@ -182,7 +191,7 @@ class SealKeeper(Keeper):
             text = f"a key offered in the name of {peer.name} is refused: it {error}"
             if text != peer.told:
                 peer.told = text
-                self._say(text, "WARN")
+                self._log.say(text, "WARN")
             return
         peer.payload, peer.offer, peer.keys = payload, offer, keys
         peer.taken_ns = peer.heard_ns = now_ns
@@ -195,7 +204,7 @@ class SealKeeper(Keeper):
         self.link.use(keys)
         self._changed_ns, self._worried = now_ns, False
         if peer is not None and keys is not None:
-            self._say(f"packets are sealed with {peer.name}", "INFO")
+            self._log.say(f"packets are sealed with {peer.name}", "INFO")
 
     def _tell_refused(self, now_ns: int) -> None:
         refused = Counter(self.link.refused)
@@ -207,7 +216,7 @@ class SealKeeper(Keeper):
             return
         self._told, self._told_ns = refused, now_ns
         counts = ", ".join(f"{count} {reason.value}" for reason, count in sorted(new.items()))
-        self._say(f"sealed packets refused: {counts}", "WARN")
+        self._log.say(f"sealed packets refused: {counts}", "WARN")
 
     def _tell_silence(self, now_ns: int) -> None:
         """Say once what people would look for in vain: all is connected, and nothing comes."""
@@ -218,14 +227,14 @@ class SealKeeper(Keeper):
         if peer.heard_ns is None:
             if peer.name in self._node.partners():
                 self._worried = True
-                self._say(
+                self._log.say(
                     f"{peer.name} is connected and offers no key: its network.packets_listen or "
                     "packets_connect may be missing",
                     "WARN",
                 )
         elif now_ns - peer.heard_ns < UNHEARD_S * 1e9:
             self._worried = True
-            self._say(
+            self._log.say(
                 f"nothing that {peer.name} has sealed arrives: is UDP let through to "
                 "network.packets_listen?",
                 "WARN",
@@ -235,8 +244,8 @@ class SealKeeper(Keeper):
 class SealedLinkKeeper(LinkKeeper):
     """Watches both of a site's nodes: by the channel, and by the offers."""
 
-    def __init__(self, channel: Channel, sealing: SealKeeper, clock: Clock, log: DaemonLog) -> None:
-        super().__init__(channel, sealing, clock, log)
+    def __init__(self, site: Site, sealing: SealKeeper, clock: Clock, log: DaemonLog) -> None:
+        super().__init__(site, sealing, sealing, clock, log)
         self._sealing = sealing
 
     def _answered(self, now_ns: int) -> bool:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Final
 
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keeper import Keeper
 
 _LOOK_S: Final = 0.5  # without a watchdog
@@ -63,9 +64,11 @@ class ServiceKeeper(Keeper):
     A thread that only lives would hide a loop that stands still. Ready is a loop that ticked once.
     """
 
-    def __init__(self, manager: ServiceManager, ticks: Callable[[], int]) -> None:
+    def __init__(self, manager: ServiceManager, ticks: Callable[[], int], log: DaemonLog) -> None:
         limit_s = manager.watchdog_s
-        super().__init__("service", _LOOK_S if limit_s is None else min(limit_s / 4.0, _LOOK_S))
+        super().__init__(
+            "service", _LOOK_S if limit_s is None else min(limit_s / 4.0, _LOOK_S), log
+        )
         self._manager = manager
         self._ticks = ticks
         self._seen = ticks()
@@ -81,6 +84,9 @@ class ServiceKeeper(Keeper):
             self._ready = True
             self._manager.ready()
         self._manager.alive()
+
+    def look_failed(self) -> None:
+        """Tell nothing: the manager takes silence for a loop that stands still."""
 
     def __exit__(
         self,

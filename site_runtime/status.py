@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from channel.packet import Reject
 from site_runtime.guard import cut_names
 from site_runtime.site import Site
 from site_runtime.site_events import Companion, SiteEvents
@@ -105,15 +104,18 @@ def describe(site: Site, rate_hz: float, *companions: Companion) -> str:
         parts.append(f"error {site.error_m * 1e3:6.1f} mm")
     if site.channel.peer_taken:
         parts.append("the peer obeys ANOTHER site than this one")
-    if site.channel.session_mismatch:
-        parts.append("the peer has ANOTHER session file")
     if site.failure is not None:
         parts.append(f"{type(site.failure).__name__}: {site.failure}")
     parts += [trouble for companion in companions if (trouble := companion.trouble) is not None]
     return " · ".join(parts)
 
 
-def summary(site: Site, console: Console, recorder: RecorderProcess | None = None) -> None:
+def summary(
+    site: Site,
+    console: Console,
+    recorder: RecorderProcess | None = None,
+    peer_trouble: str | None = None,
+) -> None:
     """Print what the run was: ticks, lateness, packets, cuts, recording, the fault if any."""
     p50, p99, p999, worst = site.lateness.percentiles_us(50, 99, 99.9, 100)
     counters = site.channel.counters
@@ -130,8 +132,8 @@ def summary(site: Site, console: Console, recorder: RecorderProcess | None = Non
         f"{counters.received} received, {counters.lost} lost, {counters.late} late, "
         f"{counters.rejected.total()} rejected",
     )
-    if counters.rejected[Reject.SESSION]:
-        table.add_row("peer", "it has ANOTHER session file: the sites engage on the same one only")
+    if peer_trouble is not None:
+        table.add_row("peer", Text(peer_trouble, style="yellow"))
     if counters.rejected:
         reasons = counters.rejected.most_common()
         table.add_row("rejected", ", ".join(f"{count} {r.name.lower()}" for r, count in reasons))

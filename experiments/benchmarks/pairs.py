@@ -66,8 +66,7 @@ def _pair(number: int, router: Router | None) -> Sites:
         f"bench-pair-{number}",
         {"loop.rate_hz": _RATE_HZ, **NO_DELAY},
         options=("--no-record",),
-        config_files=None if router is None else router.config_files,
-        through=None if router is None else router.endpoint,
+        router=None if router is None else router.endpoint,
     )
 
 

@@ -42,7 +42,7 @@ class Sites:
     """The demo's two daemons on this machine, changed as asked; within `with` they run.
 
     They record into a folder that is deleted at the end, unless `options` say otherwise.
-    `config_files` are Zenoh configurations of the sites, `through` an endpoint to meet at.
+    `router` is an endpoint to meet at.
     """
 
     def __init__(
@@ -51,14 +51,12 @@ class Sites:
         changes: Mapping[str, TomlValue | None] | None = None,
         *,
         options: Sequence[str] = (),
-        config_files: Mapping[SiteId, Path] | None = None,
-        through: str | None = None,
+        router: str | None = None,
     ) -> None:
         self._name = name
         self._changes = dict(changes or {})
         self._options = tuple(options)
-        self._config_files = dict(config_files or {})
-        self._through = through
+        self._router = router
         self._endpoints = {site: free_endpoint() for site in SiteId}
         self._processes: dict[SiteId, subprocess.Popen[bytes]] = {}
 
@@ -162,11 +160,10 @@ class Sites:
         return heard
 
     def _write_session(self, site: SiteId) -> Path:
-        config = self._config_files.get(site)
         own: dict[str, TomlValue | None] = {
             "name": self._name,
             "recorder.directory": str(Path(self._folder.name) / "recordings"),
-            "network.zenoh_config": None if config is None else str(config),
+            "network.router": self._router,
         }
         file = Path(self._folder.name) / f"{site.label}.toml"
         text = edited(DEMO.read_text(encoding="utf-8"), own | self._changes)
@@ -175,9 +172,7 @@ class Sites:
 
     def _start(self, site: SiteId) -> subprocess.Popen[bytes]:
         arguments = ["--listen", self._endpoints[site], "--duration", str(LONGEST_S), "--quiet"]
-        if self._through is not None:
-            arguments += ["--connect", self._through]
-        elif site is SiteId.LOCAL:
+        if self._router is None and site is SiteId.LOCAL:
             arguments += ["--connect", self._endpoints[SiteId.REMOTE]]
         command = [sys.executable, "-m", f"{site.label}_site", str(self._write_session(site))]
         with self._log(site).open("wb") as log:

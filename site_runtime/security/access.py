@@ -143,7 +143,9 @@ def _rule(flow: str, messages: tuple[str, ...], keys: tuple[str, ...]) -> dict[s
 def _to_peer(session_name: str, one: Identity, sealed: bool) -> tuple[str, ...]:
     site = _site(one)
     if sealed:
-        return (offer_key(session_name, site, one.person),)
+        return offer_key(session_name, site, one.person), presence_keys(
+            session_name, site, one.person
+        )
     return state_key(session_name, site, one.person), presence_keys(session_name, site, one.person)
 
 

@@ -119,6 +119,14 @@ def meet_as_router(session: Session, listen: Sequence[str] | None = None) -> Mee
     return _meet(session, ROUTER, listens, [])
 
 
+def most_relayed_hz(session: Session) -> float | None:
+    """Return how many packets a second of each site the session's relay lets through at most.
+
+    Packets that come closer together are thinned; None without a relay.
+    """
+    return None if session.network.router is None else BURST * 1e9 / session.send_period_ns
+
+
 def keys_folder(session: Session) -> Path:
     """Return the folder of the session's identities: beside the session file unless it says."""
     if session.network.keys is not None:
@@ -353,14 +361,13 @@ def _relay(
         ],
     }
     if packets:
-        most_hz = BURST * 1e9 / session.send_period_ns
         # not of telemetry, whose batches come in bursts and must all arrive
         relay["downsampling"] = [
             {
                 "id": "state-rate",
                 "flows": ["ingress"],
                 "messages": ["put"],
-                "rules": [{"key_expr": key, "freq": most_hz} for key in states],
+                "rules": [{"key_expr": key, "freq": most_relayed_hz(session)} for key in states],
             }
         ]
     return relay

@@ -334,13 +334,13 @@ def test_a_wrong_first_packet_is_no_peer() -> None:
 
 def test_another_session_is_shown_for_a_second() -> None:
     wire = Wire()
-    assert not wire.channel.session_mismatch
+    assert wire.channel.other_session is None
     wire.hear(10 * MS, wire.packet(session=78))
-    assert wire.channel.session_mismatch
+    assert wire.channel.other_session == 78
     wire.hear(999 * MS)
-    assert wire.channel.session_mismatch
+    assert wire.channel.other_session == 78
     wire.hear(1010 * MS)
-    assert not wire.channel.session_mismatch
+    assert wire.channel.other_session is None
 
 
 def test_sequence_gaps_are_losses() -> None:

@@ -136,8 +136,8 @@ def test_another_session_is_told_to_people_and_changes_nothing_else() -> None:
     exchange = Exchange()
     exchange.speak()
     exchange.listen(after=[ahead(exchange.heard[-1], session=1)])
-    assert exchange.shaken.session_mismatch
-    assert not exchange.quiet.session_mismatch
+    assert exchange.shaken.other_session is not None
+    assert exchange.quiet.other_session is None
 
 
 def test_a_silent_peer_is_not_woken_by_its_recording() -> None:

@@ -1,6 +1,5 @@
 """What is Zenoh's alone: nodes, telemetry, errors. The link itself is tests/contracts/test_link."""
 
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,6 +9,7 @@ import pytest
 
 from channel.link import LinkError
 from channel.zenoh_link import ZenohNode, ZenohSettings, _config, _ports
+from tests.ports import free_port
 
 
 def until(condition: Callable[[], bool], deadline_s: float = 20.0) -> None:
@@ -21,9 +21,7 @@ def until(condition: Callable[[], bool], deadline_s: float = 20.0) -> None:
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The contract of `channel.link.Link`, run on every implementation."""
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from channel.link import Link, TappedLink
 from channel.memory_link import memory_links
 from channel.sealed_link import PacketKeys, SealedLink
 from channel.zenoh_link import ZenohNode, ZenohSettings
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 
@@ -31,9 +31,7 @@ def until(condition: Callable[[], bool], deadline_s: float = 20.0) -> None:
 
 
 def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture(params=["memory", "tapped", "sealed", "zenoh"])

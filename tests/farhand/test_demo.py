@@ -1,7 +1,6 @@
 """`farhand demo` as a process: two daemons, Zenoh, a dashboard that serves and saves."""
 
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,19 +9,15 @@ from pathlib import Path
 import pytest
 import rerun_cli
 
+from tests.ports import free_port
+
 pytestmark = pytest.mark.processes
 DEADLINE_S = 120.0
 
 
 @pytest.fixture
 def ports() -> list[int]:
-    probes = [socket.socket() for _ in range(2)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    free = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
-    return free
+    return [free_port(), free_port()]
 
 
 @pytest.fixture

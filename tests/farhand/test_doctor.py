@@ -17,7 +17,7 @@ from hardware.simulated import SimulatedSettings
 from site_runtime.doctor_findings import Finding, Verdict
 from site_runtime.session import load_session
 from site_runtime.session_edit import edited
-from telemetry.dashboard import free_port
+from tests.ports import free_port
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 VERDICTS = {verdict.value for verdict in Verdict}

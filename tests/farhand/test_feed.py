@@ -1,6 +1,5 @@
 """Telemetry off the network: only this session's rows get through."""
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -19,6 +18,7 @@ from site_runtime.keys import SiteId, telemetry_key
 from site_runtime.session import Session, load_session
 from telemetry.dashboard.styles import STATE_COLOURS
 from telemetry.stream import TelemetryStream
+from tests.ports import free_port
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 DEADLINE_S = 20.0
@@ -31,9 +31,7 @@ def session() -> Session:
 
 @pytest.fixture
 def publish(session: Session) -> Iterator[tuple[str, Callable[[bytes], None]]]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     with closing(ZenohNode(ZenohSettings(listen=(endpoint,)))) as node:
         yield endpoint, node.publisher(telemetry_key(session.name, SiteId.LOCAL))
 

@@ -1,13 +1,9 @@
 """`farhand link-test` between two processes on loopback."""
 
 import json
-import signal
-import socket
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -15,50 +11,28 @@ import pytest
 
 from channel.delay import TraceDelay
 from channel.zenoh_link import ZenohNode, ZenohSettings
+from site_runtime.security.identity import Identity
+from tests.loopback.secured import make_keys, write_session
+from tests.ports import free_port
+from tests.running import farhand, running
 
 pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parents[2]
-DEADLINE_S = 60.0
 
 
 @pytest.fixture
 def session(tmp_path: Path) -> Path:
     """The demo's session on ports of its own."""
     text = (ROOT / "experiments" / "demo.toml").read_text(encoding="utf-8")
-    remote, local = _free_port(), _free_port()
+    remote, local = free_port(), free_port()
     path = tmp_path / "session.toml"
     path.write_text(text.replace("7447", str(remote)).replace("7448", str(local)), encoding="utf-8")
     return path
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-@contextmanager
-def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=DEADLINE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise
-
-
 def ask(session: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "farhand", "link-test", str(session), *arguments],
-        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, check=False,
-    )  # fmt: skip
+    return farhand("link-test", session, *arguments)
 
 
 def test_both_ends_measure_the_path_and_keep_its_delays(session: Path, tmp_path: Path) -> None:
@@ -116,3 +90,69 @@ def test_another_session_file_at_the_other_end_is_told(session: Path, tmp_path: 
         asked = ask(session)
     assert asked.returncode == 2
     assert "ANOTHER session file" in asked.stderr
+
+
+RATE_HZ = 200
+NETWORKS = {"directly": None, "router": "tls", "router, datagrams": "quic"}
+
+
+def secured(folder: Path, relay: str | None, *people: str) -> Path:
+    """A session with certificates and a loop of 1 kHz that sends 200 times a second."""
+    make_keys(folder / "keys", map(Identity, ("remote", "router", *(people or ("local",)))))
+    remote, local = (f"tls/127.0.0.1:{free_port()}" for _ in range(2))
+    network: dict[str, object] = {
+        "remote_listen": remote,
+        "local_listen": local,
+        "local_connect": remote,
+    }
+    if relay is not None:
+        network = {"router": f"{relay}/127.0.0.1:{free_port()}"}
+    path = write_session(folder / "session.toml", folder / "keys", **network)
+    text = path.read_text(encoding="utf-8").replace("rate_hz = 250", "rate_hz = 1000")
+    text = text.replace('injection = "off"', f'injection = "off"\nsend_rate_hz = {RATE_HZ}')
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("relay", NETWORKS.values(), ids=NETWORKS)
+def test_with_certificates_at_rates_that_reach_the_other_end(
+    tmp_path: Path, relay: str | None
+) -> None:
+    session = secured(tmp_path, relay)
+    with ExitStack() as stack:
+        if relay is not None:
+            stack.enter_context(running("farhand", "router", str(session)))
+        stack.enter_context(running("farhand", "link-test", str(session), "--answer"))
+        asked = ask(session, "--duration", "4", "--json")
+    assert asked.returncode in (0, 1), asked.stderr
+    told = json.loads(asked.stdout)
+    rates = [1000, 500, 250, 200, 100] if relay is None else [250, 200, 100]
+    assert [one["rate_hz"] for one in told["rates"]] == rates
+    assert ("rates up to 400 Hz: the router" in asked.stderr) == (relay is not None)
+    assert told["own_rate_hz"] == RATE_HZ
+    for one in told["rates"]:
+        assert 0.0 < one["round_trip"]["p50_s"] < 0.1
+        for way in ("to_remote", "to_local"):
+            assert one[way]["lost"] < 0.1  # a busy machine's; the router's limit would take half
+
+
+def test_a_rate_that_a_router_thins_is_refused_with_its_limits(tmp_path: Path) -> None:
+    asked = ask(secured(tmp_path, "tls"), "--rate", "1000")
+    assert asked.returncode == 2
+    assert "--rate 1000" in asked.stderr
+    assert "lets 800 packets a second through" in asked.stderr
+    assert "up to 400 Hz" in asked.stderr
+
+
+def test_operators_measure_each_with_his_own_keys(tmp_path: Path) -> None:
+    session = secured(tmp_path, "tls", "operator.alice", "operator.bob")
+    unsaid = ask(session, "--answer")
+    assert unsaid.returncode == 2
+    assert "--as NAME, of alice, bob" in unsaid.stderr
+    with (
+        running("farhand", "router", str(session)),
+        running("farhand", "link-test", str(session), "--answer", "--as", "bob"),
+    ):
+        asked = ask(session, "--as", "bob", "--duration", "1", "--rate", "100", "--json")
+    assert asked.returncode in (0, 1), asked.stderr
+    assert json.loads(asked.stdout)["rates"][0]["round_trip"]["p50_s"] > 0.0

@@ -1,7 +1,7 @@
 """`farhand list` and `farhand lease` where nobody shows a certificate."""
 
 import json
-import socket
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -14,6 +14,9 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from farhand.__main__ import app
 from site_runtime.keys import lease_key
 from site_runtime.lease_messages import RemoteStatus, encode_status
+from tests.loopback.secured import NAME, SecuredPair, until
+from tests.ports import free_port
+from tests.running import farhand, running
 
 DEMO = Path(__file__).parents[2] / "experiments" / "demo.toml"
 
@@ -21,9 +24,7 @@ DEMO = Path(__file__).parents[2] / "experiments" / "demo.toml"
 @pytest.fixture
 def endpoint() -> Iterator[str]:
     """A site that tells of two robots, one of them twice, and nonsense."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     over = threading.Event()
     with closing(ZenohNode(ZenohSettings(listen=(endpoint,)))) as node:
         arm, hand = node.publisher(lease_key("arm")), node.publisher(lease_key("hand"))
@@ -97,3 +98,52 @@ def test_a_session_without_names_has_no_lease(words: list[str]) -> None:
     code, said = run("lease", *words, DEMO)
     assert code == 2
     assert "whoever comes first is obeyed" in said
+
+
+def shown(place: object) -> tuple[dict[str, object], str]:
+    """What `list` says of the one robot at a place once it is ENGAGED: as JSON and as a table."""
+    robot: dict[str, object] = {}
+
+    def engaged() -> bool:
+        asked = farhand("list", place, "--json", "--wait", "2")
+        robots = json.loads(asked.stdout)
+        robot.update(*robots)
+        return asked.returncode == 0 and robot["state"] == "ENGAGED"
+
+    until(engaged, "listed as ENGAGED")
+    table = farhand("list", place, "--wait", "2", width=160)
+    assert table.returncode == 0, table.stderr
+    return robot, table.stdout
+
+
+def complete(robot: dict[str, object], table: str, name: str) -> None:
+    assert (robot["session"], robot["state"], robot["dimension"]) == (name, "ENGAGED", 2)
+    assert (robot["leased"], robot["holder"], robot["refused"]) == (False, None, {})
+    assert 0.0 < robot["round_trip_s"] < 5.0  # type: ignore[operator]
+    row = next(line for line in table.splitlines() if name in line and "│" in line)
+    cells = [cell.strip() for cell in row.strip("│").split("│")]
+    assert cells[:6] == [name, "ENGAGED", "2-D", "whoever is first", "", ""]
+    assert re.fullmatch(r"[0-9.]+ ms", cells[6])
+
+
+@pytest.mark.processes
+def test_daemons_without_certificates_by_session_file_and_by_endpoint(tmp_path: Path) -> None:
+    remote, local = free_port(), free_port()
+    text = DEMO.read_text(encoding="utf-8")
+    session = tmp_path / "session.toml"
+    session.write_text(
+        text.replace("7447", str(remote)).replace("7448", str(local)), encoding="utf-8"
+    )
+    with (
+        running("remote_site", str(session), "--no-record", "--quiet"),
+        running("local_site", str(session), "--no-record", "--quiet"),
+    ):
+        for place in (session, f"tcp/127.0.0.1:{remote}"):
+            complete(*shown(place), name="demo")
+
+
+@pytest.mark.processes
+def test_daemons_with_certificates_through_a_router(tmp_path: Path) -> None:
+    with closing(SecuredPair(tmp_path, relay="quic")) as pair:
+        pair.start("router", "remote", "local")
+        complete(*shown(pair.file), name=NAME)

@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -24,6 +23,7 @@ from site_runtime.session import Session
 from telemetry.recorded_runs import recorded_runs, recording_files
 from telemetry.rows import LAYOUT_VERSION, RowArray
 from telemetry.stream import _HEADER, MAGIC
+from tests.ports import free_port
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
 DEADLINE_S = 60.0
@@ -41,9 +41,7 @@ class Sites:
     """Both sites' publishers: they repeat the same rows, numbered on, until told to stop."""
 
     def __init__(self, session: Session, run: Run) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._session = session
         self._rows = (run.local, run.remote)
         self._node = ZenohNode(ZenohSettings(listen=(self.endpoint,)))

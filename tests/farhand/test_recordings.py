@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -34,6 +33,7 @@ from telemetry.rows import COLUMNS, DERIVED, RowArray
 from telemetry.stream import Batch
 from tests.fakes import recordings
 from tests.fakes.recordings import WALL_OFFSET_NS, record
+from tests.ports import free_port
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
 SEVEN_DOF = DEMO.with_name("seven_dof.toml")
@@ -339,13 +339,7 @@ def test_another_session_is_refused(folder: Path, tmp_path: Path) -> None:
 
 @contextmanager
 def ports() -> Iterator[tuple[str, ...]]:
-    probes = [socket.socket() for _ in range(2)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    numbers = [str(probe.getsockname()[1]) for probe in probes]
-    for probe in probes:
-        probe.close()
-    yield ("--port", numbers[0], "--web-port", numbers[1])
+    yield ("--port", str(free_port()), "--web-port", str(free_port()))
 
 
 def test_a_replay_as_fast_as_it_goes_shows_every_row(

@@ -18,7 +18,7 @@ def write_session(
     *,
     lease_s: float,
     stiffness_n_per_m: float = STIFFNESS_N_PER_M,
-    zenoh_config: Path | None = None,
+    router: str | None = None,
     operator: dict[str, object] | None = None,
     profile: str | None = None,
     channel: dict[str, object] | None = None,
@@ -46,8 +46,8 @@ def write_session(
         document["network"]["profile"] = profile
     document["network"]["allow_plaintext"] = True  # namespaces of our own
     document["network"] |= network or {}
-    if zenoh_config is not None:
-        document["network"]["zenoh_config"] = str(zenoh_config)
+    if router is not None:
+        document["network"]["router"] = router
     for contact in ("environment", "obstacles", "null_space", "sub_tasks"):
         del document["remote"][contact]
     path.write_text(tomlkit.dumps(document), encoding="utf-8")

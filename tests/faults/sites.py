@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -21,13 +20,13 @@ from site_runtime.security.identity import Identity
 from site_runtime.session import Session, load_session
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray, row_dtype
-from tests.faults import router as routing
 from tests.faults import wall_clock
 from tests.faults.companion import ROOT, Companion
 from tests.faults.network import ImpairedNetwork
 from tests.faults.observer import Recording
 from tests.faults.session import NAME, write_session
 from tests.faults.wall_clock import WallClock
+from tests.ports import free_port
 
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
 BOTH = (LOCAL, REMOTE)
@@ -90,7 +89,7 @@ class SitePair:
         self._orphan_s = orphan_s
         self._endpoints = {site: self._free_endpoint(site) for site in BOTH}
         self._router_endpoint = self._free_endpoint(LOCAL) if routed else None
-        self._router: Companion | None = None
+        self._router: subprocess.Popen[bytes] | None = None
         self.all: list[Daemon] = []
         self.daemons: dict[SiteId, Daemon] = {}
         self.clocks: dict[SiteId, WallClock] = {}
@@ -101,7 +100,7 @@ class SitePair:
         dialled = self._security is not None
         sides = BOTH if network is not None else (LOCAL,)
         self._observer_endpoints = {
-            site: self._endpoints[site] if dialled else f"tcp/127.0.0.1:{_free_port()}"
+            site: self._endpoints[site] if dialled else f"tcp/127.0.0.1:{free_port()}"
             for site in sides
         }
         recordings = {site: folder / f"observed_{site.label}.rows" for site in sides}
@@ -127,13 +126,10 @@ class SitePair:
 
     def write_session(self, site: SiteId, **changes: float) -> Path:
         """Write a session file for a site; returns its path."""
-        config = None
-        if self._router_endpoint is not None:
-            config = routing.write_site_config(self._folder / f"{site.label}.json5", site)
         return write_session(
             self._folder / f"{site.label}_{time.monotonic_ns()}.toml",
             lease_s=LAN_LEASE_S if self._network is None else WAN_LEASE_S,
-            zenoh_config=config,
+            router=self._router_endpoint,
             profile=self._profile,
             channel=self._channel,
             operator=self._operator,
@@ -177,14 +173,24 @@ class SitePair:
         self.daemons[site].process.send_signal(number)
 
     def start_router(self) -> None:
-        """Start the router that the sites were told of."""
-        assert self._router_endpoint is not None
-        self._router = Companion(self._command(LOCAL, "tests.faults.router", self._router_endpoint))
+        """Start the router that the sites were told of; returns once it relays."""
+        log = self._folder / f"router_{time.monotonic_ns()}.log"
+        command = ("farhand", "router", str(self.files[LOCAL]), "--duration", str(self._orphan_s))
+        with log.open("wb") as printed:
+            self._router = subprocess.Popen(
+                self._command(LOCAL, *command),
+                cwd=ROOT,
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=printed,
+            )
+        self.until(lambda: b"farhand router" in log.read_bytes(), "the router relays")
 
     def kill_router(self) -> None:
         """Kill it."""
         assert self._router is not None
         self._router.kill()
+        self._router.wait()
 
     def rows(self, site: SiteId, since_ns: int = 0) -> RowArray:
         """Rows of a site's present run."""
@@ -251,8 +257,10 @@ class SitePair:
         """Kill all that was started."""
         for daemon in self.all:
             self.end(daemon)
-        for companion in (*self._observers, *([self._router] if self._router else ())):
-            companion.close()
+        if self._router is not None:
+            self.kill_router()
+        for observer in self._observers:
+            observer.close()
         for clock in self.clocks.values():
             clock.close()
 
@@ -295,7 +303,7 @@ class SitePair:
         security: dict[str, object] = {"security": "mtls", "keys": str(authority.folder)}
         if self._sealed:
             address = hosts[REMOTE % len(hosts)]
-            place = f"udp/{address}:{_free_port()}"
+            place = f"udp/{address}:{free_port()}"
             security |= {"packets_listen": place, "packets_connect": place}
         return security
 
@@ -321,11 +329,4 @@ class SitePair:
 
     def _free_endpoint(self, site: SiteId) -> str:
         address = "127.0.0.1" if self._network is None else self._network.address(site)
-        return f"{self._protocol}/{address}:{_free_port()}"
-
-
-def _free_port() -> int:
-    """Return a port that nobody has on this machine, so in a fresh namespace neither."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+        return f"{self._protocol}/{address}:{free_port()}"

@@ -23,7 +23,7 @@ CAPACITY = 512
 _TOLD = [
     name
     for name, member in vars(Channel).items()
-    if isinstance(member, property) and name != "session_mismatch"
+    if isinstance(member, property) and name != "other_session"
 ]
 
 

@@ -19,6 +19,7 @@ from site_runtime.security.identity import Identity
 from site_runtime.session import Session, load_session
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray
+from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 NAME = "secured"
@@ -29,12 +30,6 @@ LOOPBACK = ("127.0.0.1",)
 PARTIES = tuple(Identity(name) for name in ("local", "remote", "router", "dashboard"))
 FORGED = b"forged"
 FORGED_S = 0.8
-
-
-def free_port(kind: int = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def until(condition: Callable[[], bool], what: str, within_s: float = DEADLINE_S) -> None:
@@ -146,6 +141,9 @@ class SecuredPair:
         process = self._processes.pop(name)
         process.kill()
         process.wait()
+
+    def signal(self, name: str, number: int) -> None:
+        self._processes[name].send_signal(number)
 
     def text(self, name: str) -> str:
         """What it printed."""

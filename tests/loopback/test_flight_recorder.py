@@ -5,7 +5,6 @@ import random
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ import pytest
 
 from site_runtime.supervisor import State
 from telemetry.recording import Recording, read_recording
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 
@@ -45,9 +45,7 @@ robot = { kind = "planar", lengths_m = [0.4, 0.4], masses_kg = [1.0, 1.0] }
 
 
 def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @dataclass

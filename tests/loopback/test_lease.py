@@ -1,4 +1,4 @@
-"""One robot, three people with certificates, a relay: who drives, who is told what."""
+"""One robot, three people with certificates, a relay or none: who drives, who is told what."""
 
 import json
 import os
@@ -16,18 +16,20 @@ from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.keys import SiteId, claim_key, state_key
 from site_runtime.lease import Verb, Wish
 from site_runtime.lease_messages import RemoteStatus, decode_status, encode_wish
+from site_runtime.link_keeper import ASK_S, UNHEARD_S
 from site_runtime.security.identity import Identity
 from telemetry.recorded_runs import recorded_runs, recording_files
+from tests.loopback.remote_that_fails import FAIL
 from tests.loopback.secured import (
     NAME,
     ORPHAN_S,
     ROOT,
-    free_port,
     make_keys,
     tls,
     until,
     write_session,
 )
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 PARTIES = tuple(
@@ -47,17 +49,25 @@ SILENCE_S = 2.0
 class Robot:
     """A remote site that records, its relay, operators' local sites, and what `list` says."""
 
-    def __init__(self, folder: Path, **network: object) -> None:
+    def __init__(self, folder: Path, *, routed: bool, **packets: object) -> None:
         self.folder = folder
         self.keys = folder / "keys"
         make_keys(self.keys, PARTIES)
-        self.relay = f"tls/127.0.0.1:{free_port()}"
+        self.routed = routed
+        self.place = f"tls/127.0.0.1:{free_port()}"  # where all meet: the relay, or the robot
+        network = {"router": self.place}
+        if not routed:
+            network = {
+                "remote_listen": self.place,
+                "local_connect": self.place,
+                "local_listen": f"tls/127.0.0.1:{free_port()}",
+            }
         self.file = write_session(
             folder / "session.toml",
             self.keys,
-            router=self.relay,
             operator_silence_s=SILENCE_S,
             **network,
+            **packets,
         )
         text = self.file.read_text(encoding="utf-8")
         self.file.write_text(
@@ -76,7 +86,9 @@ class Robot:
             )
 
     def start_operator(self, name: str) -> None:
-        self.start(name, "local_site", str(self.file), "--as", name, "--no-record")
+        # each on a machine of his own else, where he listens for dashboards
+        own = () if self.routed else ("--listen", f"tls/127.0.0.1:{free_port()}")
+        self.start(name, "local_site", str(self.file), "--as", name, "--no-record", *own)
 
     def end(self, name: str, number: int = signal.SIGINT) -> None:
         process = self.processes.pop(name)
@@ -109,8 +121,7 @@ class Ear:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        configuration = tls(robot.keys / "dashboard") | {"region_name": "observer"}
-        self._node = ZenohNode(ZenohSettings(connect=(robot.relay,), configuration=configuration))
+        self._node = behind(robot, "dashboard", "observer")
         self._ear = self._node.subscriber(f"farhand/{NAME}/remote/lease", 100)
         self.status: RemoteStatus | None = None
 
@@ -146,21 +157,21 @@ class Ear:
         self._node.close()
 
 
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    robot = Robot(tmp_path)
-    try:
-        robot.start("router", "farhand", "router", str(robot.file))
+@pytest.fixture(params=[True, False], ids=["router", "no router"])
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
+    with closing(Robot(tmp_path, routed=request.param)) as robot:
+        if robot.routed:
+            robot.start("router", "farhand", "router", str(robot.file))
         robot.start("remote", "remote_site", str(robot.file))
         yield robot
-    finally:
-        robot.close()
 
 
 def behind(robot: Robot, identity: str, region: str = "local") -> ZenohNode:
-    """A node at the relay that enforces nothing itself."""
-    configuration = tls(robot.keys / identity) | {"region_name": region}
-    return ZenohNode(ZenohSettings(connect=(robot.relay,), configuration=configuration))
+    """A node at the relay, or dialling the robot, that enforces nothing itself."""
+    configuration = tls(robot.keys / identity)
+    if robot.routed:
+        configuration["region_name"] = region
+    return ZenohNode(ZenohSettings(connect=(robot.place,), configuration=configuration))
 
 
 def events(robot: Robot) -> list[str]:
@@ -193,7 +204,8 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
 
         # words in another's name, and poses in one's own, do nothing
         with closing(behind(robot, "operator.bob")) as thief:
-            until(lambda: thief.partners() == ("router-1",), "a connection")
+            partner = "router-1" if robot.routed else "remote-1"
+            until(lambda: thief.partners() == (partner,), "a connection")
             claims = thief.publisher(claim_key(NAME, "alice"))
             poses = thief.publisher(state_key(NAME, SiteId.LOCAL, "alice"))
             own = thief.publisher(claim_key(NAME, "bob"))
@@ -243,6 +255,9 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
         robot.end("alice", signal.SIGKILL)
         robot.end("bob")
         ear.until(None, "READY")
+        time.sleep(2.5 * (UNHEARD_S + ASK_S))
+        # nobody to hear is no reason to leave the network
+        assert "the connection is opened anew" not in robot.text("remote")
     robot.end("remote")
     told = events(robot)
     expected = [
@@ -270,3 +285,25 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
     for i, line in enumerate(states):
         if "holds it" in line and "refused" not in line and "gives" not in line:
             assert "READY" in line, (i, states)
+
+
+def test_a_lease_that_cannot_be_kept_is_told_and_ended_and_goes_on(tmp_path: Path) -> None:
+    """The safe side of a surprise: outputs off, then whoever claims it, by the usual way."""
+    with closing(Robot(tmp_path, routed=False)) as robot:
+        robot.start("remote", "tests.loopback.remote_that_fails", str(robot.file))
+        with closing(Ear(robot)) as ear, closing(behind(robot, "operator.alice")) as words:
+            robot.start_operator("alice")
+            say = words.publisher(claim_key(NAME, "alice"))
+            for times in range(1, 3):
+                ear.until("alice", "ENGAGED")
+                say(FAIL)
+                until(
+                    lambda times=times: (
+                        robot.text("remote").count("lease: alice loses it") == times
+                    ),
+                    "the lease ended",
+                )
+            ear.until("alice", "ENGAGED")
+        text = robot.text("remote")
+    assert text.count("keeping the lease failed, and goes on: RuntimeError: words") == 1
+    assert text.count("READY: the lease is over") + text.count("READY: nobody here") >= 2

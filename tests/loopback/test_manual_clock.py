@@ -196,7 +196,7 @@ def test_another_session_at_the_other_end_never_engages(
     pair.run(1.0)
     for site in pair.sites.values():
         assert site.state is State.READY
-        assert site.channel.session_mismatch
+        assert site.channel.other_session is not None
         assert not pair.rows(site.identity, 1.0)["torque_nm"].any()
 
 

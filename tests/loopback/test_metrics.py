@@ -23,6 +23,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from site_runtime.keys import SiteId
 from site_runtime.session import load_session
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 
@@ -56,12 +57,6 @@ damping = { joint_nm_s = [0.2, 0.2], task_n_s_per_m = [15.0, 15.0] }
 device = { driver = "simulated", initial_position_rad = [-0.3, 1.65] }
 robot = { kind = "planar", lengths_m = [0.4, 0.4], masses_kg = [1.0, 1.0] }
 """)
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def until(condition: Callable[[], object], what: Callable[[], str]) -> None:

@@ -21,12 +21,12 @@ from tests.loopback.secured import (
     SecuredPair,
     dialling,
     ended,
-    free_port,
     make_keys,
     tls,
     until,
     write_session,
 )
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE

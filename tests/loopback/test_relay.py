@@ -1,6 +1,7 @@
 """`farhand router`: two daemons that meet at a relay, and those who try through it."""
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -11,6 +12,8 @@ import pytest
 
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.keys import SiteId, state_key
+from site_runtime.link_keeper import ASK_S, UNHEARD_S
+from site_runtime.security.network import meet_as_site
 from tests.loopback.secured import FORGED, NAME, RATE_HZ, ROOT, SecuredPair, tls, until
 
 pytestmark = pytest.mark.processes
@@ -90,6 +93,28 @@ def test_a_flood_through_the_relay_is_thinned(pair: SecuredPair) -> None:
             publish(FORGED)
         passed = pair.rejected(LOCAL) - before
         assert passed <= 4 * RATE_HZ * (time.monotonic() - begin_s) + 10
+
+
+def test_the_relay_tells_a_site_whether_its_peer_is_there_and_one_that_stands_still_nothing(
+    pair: SecuredPair,
+) -> None:
+    """With the access control of both; a site that is told of none waits and stays connected."""
+    with closing(ZenohNode(meet_as_site(pair.session, LOCAL).settings)) as node:
+        link = node.link(state_key(NAME, LOCAL), state_key(NAME, REMOTE))
+        until(lambda: node.partners() == ("router-1",), "a connection")
+        until(lambda: link.ask_for_peer(2.0) is True, "told of the remote site")
+        pair.kill("remote")
+        until(lambda: link.ask_for_peer(2.0) is False, "told of its absence")
+        time.sleep(2.5 * (UNHEARD_S + ASK_S))
+        assert "the connection is opened anew" not in pair.text("local")
+        assert pair.text("router").count("local-1 gone") == 0
+        pair.signal("router", signal.SIGSTOP)
+        try:
+            assert link.ask_for_peer(0.5) is None  # sooner than any lease is over
+        finally:
+            pair.signal("router", signal.SIGCONT)
+    pair.start("remote")
+    pair.until_engaged()
 
 
 def test_a_relay_that_was_killed_is_replaced_and_the_pair_engages_again(pair: SecuredPair) -> None:

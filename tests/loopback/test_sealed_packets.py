@@ -21,6 +21,7 @@ from channel.packet import PacketError, decode, encode
 from channel.sealed_link import OVERHEAD_BYTES, Refusal
 from channel.zenoh_link import Subscription, ZenohNode, ZenohSettings
 from site_runtime.clock import SteadyClock
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keys import SiteId, lease_key, offer_key, state_key, telemetry_key
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.seal_keeper import SealKeeper
@@ -31,19 +32,20 @@ from site_runtime.security.network import Meeting, meet_as_site
 from site_runtime.security.offer import OwnOffer
 from site_runtime.session import load_session
 from site_runtime.supervisor import State
+from telemetry.events import Level
 from tests.loopback.secured import (
     FORGED,
     LOOPBACK,
     NAME,
     ROOT,
     SecuredPair,
-    free_port,
     make_keys,
     tls,
     until,
     write_session,
 )
 from tests.loopback.test_lease import Ear, Robot
+from tests.ports import free_port
 
 pytestmark = pytest.mark.processes
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
@@ -391,7 +393,9 @@ def test_a_link_test_goes_where_the_sites_packets_go(tmp_path: Path) -> None:
 
 def test_the_lease_goes_from_hand_to_hand_and_the_seal_with_it(tmp_path: Path) -> None:
     packets = f"udp/127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
-    with closing(Robot(tmp_path, packets_listen=packets, packets_connect=packets)) as robot:
+    with closing(
+        Robot(tmp_path, routed=True, packets_listen=packets, packets_connect=packets)
+    ) as robot:
         robot.start("router", "farhand", "router", str(robot.file))
         robot.start("remote", "remote_site", str(robot.file))
         with closing(Ear(robot)) as ear:
@@ -413,6 +417,17 @@ def test_the_lease_goes_from_hand_to_hand_and_the_seal_with_it(tmp_path: Path) -
         for name in ("alice", "bob"):  # who waits is not told of packets that are for others
             assert "refused: " not in robot.text(name).replace("lease: refused", "")
             assert "opened anew" not in robot.text(name)
+
+
+class Heard(DaemonLog):
+    """Keeps what is said."""
+
+    def __init__(self, said: list[str]) -> None:
+        super().__init__("test")
+        self.said = said
+
+    def say(self, text: str, level: Level = "INFO") -> None:
+        self.said.append(text)
 
 
 class Relay:
@@ -446,7 +461,7 @@ class Relay:
         packets = enter(closing(ZenohNode(meeting.packets)))
         seal = SealKeeper(
             self.session, site, meeting, time.time_ns(), node, packets, SteadyClock(),
-            OperatorRequests(), lambda text, _: said.append(text),
+            OperatorRequests(), Heard(said),
         )  # fmt: skip
         return enter(seal)
 

@@ -4,9 +4,9 @@ All three are on one machine, so all stamps are on one CLOCK_MONOTONIC: what a s
 age of its peer's samples can be held against the peer's own record.
 """
 
+import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,6 +23,7 @@ from site_runtime.keys import SiteId, telemetry_key
 from site_runtime.supervisor import DRIVEN, State
 from telemetry.rows import NO_PEER_STATE, RowArray
 from telemetry.stream import decode_batch
+from tests.ports import free_port
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -241,13 +242,7 @@ class Rig:
 
 
 def free_endpoints(count: int) -> list[str]:
-    probes = [socket.socket() for _ in range(count)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    endpoints = [f"tcp/127.0.0.1:{probe.getsockname()[1]}" for probe in probes]
-    for probe in probes:
-        probe.close()
-    return endpoints
+    return [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
 
 
 @pytest.fixture
@@ -396,6 +391,31 @@ def test_another_session_file_never_engages_and_is_told(rig: Rig) -> None:
     for daemon in daemons:
         assert daemon.stop() == 0
         assert "ANOTHER session file" in daemon.text()
+
+
+def test_another_network_profile_is_named_at_both_sites(rig: Rig) -> None:
+    """In the status line, as an event, in JSON too, and in the summary."""
+    profiles = {LOCAL: "lan", REMOTE: "wan"}
+    sessions = {}
+    for site, profile in profiles.items():
+        path = rig.session(profile)
+        text = path.read_text(encoding="utf-8")
+        path.write_text(
+            text.replace("[network]", f'[network]\nprofile = "{profile}"'), encoding="utf-8"
+        )
+        sessions[site] = path
+    local = rig.start(LOCAL, sessions[LOCAL])
+    remote = rig.start(REMOTE, sessions[REMOTE], "--log", "json")
+    there = {
+        LOCAL: '"wan" or "lossy", here it is "lan"',
+        REMOTE: '"lan" or "wifi", here it is "wan"',
+    }
+    rig.until(lambda: there[LOCAL] in local.text(), "the local site tells")
+    in_json = json.dumps(there[REMOTE])[1:-1]
+    rig.until(lambda: in_json in remote.text(), "the remote site tells")
+    assert local.stop() == 0
+    assert local.text().count(there[LOCAL]) >= 2
+    assert remote.stop() == 0
 
 
 def test_a_suspended_site_is_held_for_and_returns_to_fresh_samples(rig: Rig) -> None:

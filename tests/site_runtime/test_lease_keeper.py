@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from site_runtime.clock import ManualClock
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.lease import LeaseRules, Verb, Wish
 from site_runtime.lease_claimant import LeaseClaimant
 from site_runtime.lease_keeper import LeaseKeeper
@@ -56,8 +57,18 @@ class Place:
         )
         self.ears = {name: Words() for name in self.names}
         self.keeper = LeaseKeeper(
-            SESSION, self.site, 5, self.clock, self, self.ears, LeaseRules(5 * S), self.out
+            SESSION,
+            self.site,
+            5,
+            self.clock,
+            self,
+            self.ears,
+            LeaseRules(5 * S),
+            self.out,
+            DaemonLog("remote"),
         )
+        assert self.turned == [None] * bool(self.names), "heard somebody at first"
+        self.turned.clear()
 
     def listen_to(self, peer_key: str | None) -> None:
         if peer_key is not None:
@@ -180,7 +191,7 @@ def told(holder: str | None, **refused: str) -> bytes:
 def test_an_operators_site_waits_for_the_remotes_word_and_follows_it() -> None:
     site = SimpleNamespace(requests=OperatorRequests(), notices=deque[str]())
     ear, out = Words(), Words()
-    claimant = LeaseClaimant("bob", 7, site, ear, out)  # type: ignore[arg-type]
+    claimant = LeaseClaimant("bob", 7, site, ear, out, DaemonLog("local"))  # type: ignore[arg-type]
     assert site.requests.take() == UNLEASED
     claimant.look()
     assert out.said == [encode_wish(Wish(Verb.CLAIM, 7))]
@@ -205,3 +216,43 @@ def test_an_operators_site_waits_for_the_remotes_word_and_follows_it() -> None:
         "lease: bob holds the remote robot",
         "lease: not held",
     ]
+
+
+def test_a_look_that_failed_ends_the_lease_through_rest() -> None:
+    place = Place()
+    place.say("alice", Verb.CLAIM, 1)
+    place.look()
+    place.site.state = State.ENGAGED
+    place.keeper.look_failed()
+    assert place.site.requests.take() == UNLEASED  # at once, and before any look succeeds
+    place.look()
+    place.site.state = State.READY
+    place.say("alice", Verb.CLAIM, 1)
+    place.look()
+    assert place.turned[-2:] == [None, f"farhand/{SESSION.name}/local/alice/state"]
+    assert list(place.site.notices)[2:] == [
+        "lease: alice loses it: it could not be kept",
+        "lease: alice holds it",
+    ]
+
+
+def test_without_names_a_look_that_failed_changes_nothing() -> None:
+    place = Place(names=())
+    place.keeper.look_failed()
+    assert place.site.requests.take() == 0
+
+
+def test_an_operators_site_whose_look_failed_drives_no_more_until_it_is_told_anew() -> None:
+    site = SimpleNamespace(requests=OperatorRequests(), notices=deque[str]())
+    ear, out = Words(), Words()
+    claimant = LeaseClaimant("bob", 7, site, ear, out, DaemonLog("local"))  # type: ignore[arg-type]
+    ear(told("bob"))
+    claimant.look()
+    assert claimant.holds
+    claimant.look_failed()
+    assert site.requests.take() == UNLEASED
+    claimant.look()
+    assert site.requests.take() == UNLEASED
+    ear(told("bob"))
+    claimant.look()
+    assert site.requests.take() == 0

@@ -8,6 +8,7 @@ from channel.packet import Reject
 from site_runtime.clock import ManualClock
 from site_runtime.daemon_log import DaemonLog
 from site_runtime.link_keeper import LONGEST_S, UNHEARD_S, LinkKeeper
+from site_runtime.operator_requests import OperatorRequests
 
 S = 1_000_000_000
 
@@ -21,17 +22,25 @@ class Watched:
     echoed_ns: int | None = None
     peer_taken: bool = False
     connected: bool = True
+    there: bool | None = True
+    """What is answered to whether the peer is there; None if nothing is."""
     opened_s: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.counters = SimpleNamespace(rejected=Counter[Reject]())
-        self.keeper = LinkKeeper(self, self, self.clock, DaemonLog("local"))  # type: ignore[arg-type]
+        self.requests = OperatorRequests()
+        site = SimpleNamespace(channel=self, requests=self.requests)
+        self.keeper = LinkKeeper(site, self, self, self.clock, DaemonLog("local"))
 
     def dialled(self) -> bool:
         return self.connected
 
     def reopen(self) -> None:
         self.opened_s.append(self.clock.now_ns() / S)
+
+    def ask_for_peer(self, within_s: float) -> bool | None:
+        assert within_s <= UNHEARD_S
+        return self.there
 
     def pass_time(self, until_s: int, *, speaks: bool, hears: bool, refused: int = 0) -> None:
         for half in range(2 * int(self.clock.now_ns() / S) + 1, 2 * until_s + 1):
@@ -64,15 +73,38 @@ def test_a_peer_that_does_not_answer_has_the_link_opened_anew_less_and_less_ofte
     assert watched.opened_s[-1] - watched.opened_s[-2] == LONGEST_S
 
 
+@pytest.mark.parametrize("there", [True, None])
 def test_one_that_has_never_answered_counts_as_well(
-    watched: Watched, capsys: pytest.CaptureFixture[str]
+    watched: Watched, there: bool | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    watched.there = there
     watched.pass_time(4, speaks=False, hears=False)
     assert watched.opened_s == [UNHEARD_S]
-    assert capsys.readouterr().err == ""  # behind a router it may just not have been started
-    watched.pass_time(11, speaks=True, hears=False)
-    assert len(watched.opened_s) == 2
     assert "opened anew" in capsys.readouterr().err
+
+
+def test_one_that_is_not_there_is_no_reason_until_nobody_says_so(
+    watched: Watched, capsys: pytest.CaptureFixture[str]
+) -> None:
+    watched.pass_time(5, speaks=True, hears=True)
+    watched.there = False
+    watched.pass_time(200, speaks=False, hears=False)
+    assert watched.opened_s == []
+    assert capsys.readouterr().err == ""
+    watched.there = None
+    watched.pass_time(204, speaks=False, hears=False)
+    assert len(watched.opened_s) == 1
+
+
+def test_without_the_lease_the_peer_need_not_answer_but_the_connection_must(
+    watched: Watched,
+) -> None:
+    watched.requests.unleased = True
+    watched.pass_time(20, speaks=True, hears=False)
+    assert watched.opened_s == []
+    watched.there = None
+    watched.pass_time(24, speaks=False, hears=False)
+    assert len(watched.opened_s) == 1
 
 
 def test_an_outage_is_waited_out(watched: Watched) -> None:

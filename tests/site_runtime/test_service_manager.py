@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.service_manager import ServiceKeeper, ServiceManager
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +63,7 @@ def ear(request: pytest.FixtureRequest) -> Iterator[Ear]:
 def test_a_loop_that_ticks_is_ready_once_and_alive_until_it_stands_still(ear: Ear) -> None:
     ticks = [0]
     with closing(ServiceManager({"NOTIFY_SOCKET": ear.address})) as manager:
-        keeper = ServiceKeeper(manager, lambda: ticks[0])
+        keeper = ServiceKeeper(manager, lambda: ticks[0], DaemonLog("local"))
         keeper.look()
         assert ear.waiting() == []
         ticks[0] = 1

@@ -64,10 +64,8 @@ def test_before_the_peer_is_there_no_number_is_shown(fresh: Site) -> None:
 
 
 def test_the_line_says_what_went_wrong(fresh: Site) -> None:
-    fresh.channel._now_ns = fresh.channel._mismatch_ns = 5
     fresh.failure = ArithmeticError("the controller broke")
     line = describe(fresh, 100.0)
-    assert "ANOTHER session file" in line
     assert line.endswith("ArithmeticError: the controller broke")
 
 

@@ -19,7 +19,6 @@ from telemetry.dashboard import (
     LiveServer,
     Painter,
     RecordingFile,
-    free_port,
     save_recording,
     start_viewer,
 )
@@ -29,6 +28,7 @@ from telemetry.dashboard.stages import latency_text
 from telemetry.dashboard.styles import STATE_COLOURS, written
 from telemetry.picture import Scene
 from telemetry.rows import RowArray, TelemetryError, row_dtype
+from tests.ports import free_port
 from tests.telemetry.boards import (
     DEADLINE_S,
     MS,

@@ -18,11 +18,11 @@ from telemetry.dashboard import (
     Dashboard,
     LiveServer,
     draw,
-    free_port,
     headless_viewer,
     screenshot,
 )
 from telemetry.picture import LOCAL_COLOUR, RED, REMOTE_COLOUR
+from tests.ports import free_port
 from tests.telemetry.boards import (
     MS,
     PASSAGES_NS,

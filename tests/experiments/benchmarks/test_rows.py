@@ -52,7 +52,7 @@ def test_a_figure_and_its_yardstick_are_measured(
         for spread in (row.ours, row.yardstick):
             assert spread.count >= least_samples
             p50, p99, p999 = spread.percentiles
-            assert 0.0 <= p50 <= p99 <= p999
+            assert -1e-9 <= p50 <= p99 <= p999  # what is beyond a median may round below it
             assert isfinite(p999)
         assert row.verdict in Verdict
         assert all(isfinite(goal.value) for goal in row.goals)
