@@ -300,10 +300,11 @@ class ZenohNode:
         """Return who is connected: the name in the certificate, or else the address."""
         if self._closed:
             return ()
-        names = {
-            str(link.zid): link.auth_identifier or str(link.dst)
-            for link in self._session.info.links()
-        }
+        try:
+            links = self._session.info.links()
+        except zenoh.ZError:  # being opened anew
+            return ()
+        names = {str(link.zid): link.auth_identifier or str(link.dst) for link in links}
         return tuple(sorted(names.values()))
 
     def dialled(self) -> bool:

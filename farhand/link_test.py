@@ -1,8 +1,9 @@
 """`farhand link-test`."""
 
 import json
-from collections.abc import Callable, Sequence
-from contextlib import closing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
@@ -11,11 +12,12 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from channel.link import LinkError
+from channel.link import Link, LinkError
 from channel.zenoh_link import ZenohNode
 from farhand.console import ERR, OUT, say, user_errors
 from site_runtime.clock import SteadyClock
-from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals
+from site_runtime.daemon import Connect, Listen, SessionPath, StopSignals, packets_node
+from site_runtime.daemon_log import DaemonLog
 from site_runtime.keys import SiteId, state_key
 from site_runtime.link_figures import Figures, Passage, Spread, figures, traces
 from site_runtime.link_test import (
@@ -28,13 +30,16 @@ from site_runtime.link_test import (
 )
 from site_runtime.margin import margin_of
 from site_runtime.network_profiles import PROFILES, fitting
+from site_runtime.operator_requests import OperatorRequests
 from site_runtime.real_time import apply_real_time
+from site_runtime.seal_keeper import SealKeeper
 from site_runtime.security.identity import SecurityError
 from site_runtime.security.network import BURST, Meeting, meet_as_site
 from site_runtime.session import Session, load_session
 
 EXIT_NOT_COVERED = 1
 TRACES = ("local_to_remote.csv", "remote_to_local.csv")
+_CAPACITY = 1024
 _MARGIN = 1.1  # of the certificate over the longest loop that was seen
 
 
@@ -84,15 +89,10 @@ def link_test(
         clock = SteadyClock()
         cpus = loaded.real_time
         with (
-            closing(_node(meeting)) as node,
+            _link(loaded, site, meeting, person, clock) as link,
             StopSignals(clock, None) as signals,
             apply_real_time(cpus, cpus.remote_cpu if answer else cpus.local_cpu),
         ):
-            keys = {
-                SiteId.LOCAL: state_key(loaded.name, SiteId.LOCAL, person),
-                SiteId.REMOTE: state_key(loaded.name, SiteId.REMOTE),
-            }
-            link = node.link(keys[site], keys[site.peer], capacity=1024)
             probe = Probe(loaded, site, link, clock)
             if answer:
                 _tell(f"answering for the {site.label} site until Ctrl-C")
@@ -127,13 +127,40 @@ def _whom(meeting: Meeting, operator: str | None) -> str | None:
     return operator
 
 
-def _node(meeting: Meeting) -> ZenohNode:
-    try:
-        return ZenohNode(meeting.settings)
-    except LinkError as error:
-        raise LinkTestError(
-            f"{error}. If a site, or another link test, runs on this machine, stop it first"
-        ) from error
+@contextmanager
+def _link(
+    session: Session, site: SiteId, meeting: Meeting, person: str | None, clock: SteadyClock
+) -> Iterator[Link]:
+    """Stand in a site's place: where its packets go, sealed if they are."""
+    keys = {
+        SiteId.LOCAL: state_key(session.name, SiteId.LOCAL, person),
+        SiteId.REMOTE: state_key(session.name, SiteId.REMOTE),
+    }
+    with ExitStack() as stack:
+        try:
+            node = stack.enter_context(closing(ZenohNode(meeting.settings)))
+            packets = stack.enter_context(packets_node(meeting))
+        except LinkError as error:
+            raise LinkTestError(
+                f"{error}. If a site, or another link test, runs on this machine, stop it first"
+            ) from error
+        if packets is None:
+            yield node.link(keys[site], keys[site.peer], capacity=_CAPACITY)
+            return
+        sealing = SealKeeper(
+            session,
+            site,
+            meeting,
+            time.time_ns(),
+            node,
+            packets,
+            clock,
+            OperatorRequests(),
+            DaemonLog(site.label),
+            _CAPACITY,
+        )
+        sealing.listen_to(keys[site.peer])
+        yield stack.enter_context(sealing).link
 
 
 def _require_rates(session: Session, rates: Sequence[int]) -> None:
@@ -240,7 +267,8 @@ def _print(session: Session, measured: Sequence[Figures], own: Figures, certifie
 
 
 def _protocol(name: str) -> str:
-    return ", udp/ or quic/ endpoints" if PROFILES[name].loss_tolerant else ""
+    tolerant = PROFILES[name].loss_tolerant
+    return ", udp/ or quic/ endpoints, or packets_connect" if tolerant else ""
 
 
 def _ms(spread: Spread) -> str:

@@ -10,11 +10,11 @@ import typer
 from channel.zenoh_link import Subscription, ZenohNode, stock_configuration
 from farhand.console import ERR, user_errors
 from site_runtime.clock import SteadyClock
-from site_runtime.daemon import Duration, Listen, SessionPath, StopSignals
+from site_runtime.daemon import Duration, Listen, SessionPath, StopSignals, packets_node
 from site_runtime.keys import SiteId, state_key
 from site_runtime.security.network import meet_as_router
 from site_runtime.service_manager import ServiceManager
-from site_runtime.session import load_session
+from site_runtime.session import SessionError, load_session
 
 POLL_S = 0.2
 STATUS_S = 10.0
@@ -29,6 +29,12 @@ def router(
         bool,
         typer.Option("--print-config", help="Print the configuration for a zenohd, and end."),
     ] = False,
+    print_packets_config: Annotated[
+        bool,
+        typer.Option(
+            "--print-packets-config", help="Print that of a zenohd for sealed packets, and end."
+        ),
+    ] = False,
 ) -> None:
     """Relay a session between its sites and observers until Ctrl-C: where network.router says."""
     with user_errors():
@@ -37,15 +43,24 @@ def router(
         if print_config:
             typer.echo(stock_configuration(meeting.settings))
             return
+        if print_packets_config:
+            if meeting.packets is None:
+                raise SessionError("network.packets_listen is missing: no packets are sealed")
+            typer.echo(stock_configuration(meeting.packets))
+            return
         for warning in meeting.warnings:
             _say(warning, "yellow")
+        listens = [*meeting.settings.listen]
+        if meeting.packets is not None:
+            listens += meeting.packets.listen
         with (
             closing(ZenohNode(meeting.settings)) as node,
+            packets_node(meeting) as packets,
             closing(ServiceManager()) as manager,
             StopSignals(SteadyClock(), duration) as signals,
         ):
             _say(
-                f"farhand router · session {loaded.name} · {', '.join(meeting.settings.listen)} · "
+                f"farhand router · session {loaded.name} · {', '.join(listens)} · "
                 + (meeting.credentials.common_name if meeting.credentials else "no certificates")
             )
             # not the telemetry, which else would be sent here when nobody looks
@@ -54,7 +69,7 @@ def router(
             heard = [
                 _Rate(
                     person or site.label,
-                    node.subscriber(state_key(loaded.name, site, person), _CAPACITY),
+                    (packets or node).subscriber(state_key(loaded.name, site, person), _CAPACITY),
                 )
                 for site, person in parties
             ]

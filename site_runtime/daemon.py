@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from channel.link import LinkError
+from channel.sealed_link import SealedLink
 from channel.zenoh_link import ZenohLink, ZenohNode
 from hardware.interface import HardwareError
 from site_runtime.assembly import Surroundings
@@ -21,12 +22,13 @@ from site_runtime.daemon_log import DaemonLog, LogFormat
 from site_runtime.flight_recorder import start_recorder
 from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
 from site_runtime.lease_claimant import LeaseClaimant
-from site_runtime.lease_keeper import LeaseKeeper, rules_of
+from site_runtime.lease_keeper import LeaseKeeper, Switch, rules_of
 from site_runtime.link_keeper import LinkKeeper
 from site_runtime.metrics import MetricsAddress, metrics_address, start_metrics
 from site_runtime.operator_requests import OperatorRequests
 from site_runtime.other_session import OtherSession
 from site_runtime.real_time import RealTimeError, apply_real_time
+from site_runtime.seal_keeper import SealedLinkKeeper, SealKeeper
 from site_runtime.security.network import Meeting, meet_as_site
 from site_runtime.service_manager import ServiceKeeper, ServiceManager
 from site_runtime.session import Session, SessionError, load_session
@@ -158,15 +160,26 @@ def run_daemon(
         clock = SteadyClock()
         requests = OperatorRequests()
         shares_rows = options.record or options.metrics is not None
+        epoch = time.time_ns()
         with (
             closing(ZenohNode(meeting.settings)) as node,
+            packets_node(meeting) as packets,
             closing(SharedMemory()) as memory,
             closing(ServiceManager()) as manager,
         ):
-            link = node.link(
-                state_key(session.name, identity, meeting.person),
-                state_key(session.name, identity.peer, _first_peer(identity, meeting)),
-            )
+            link: ZenohLink | SealedLink
+            switch: ZenohLink | SealKeeper
+            if packets is None:
+                sealing = None
+                link = switch = node.link(
+                    state_key(session.name, identity, meeting.person),
+                    state_key(session.name, identity.peer, _first_peer(identity, meeting)),
+                )
+            else:
+                sealing = switch = SealKeeper(
+                    session, identity, meeting, epoch, node, packets, clock, requests, log
+                )
+                link = sealing.link
             publish = node.publisher(telemetry_key(session.name, identity, meeting.person))
             if meeting.person is not None:
                 publish = _while_leased(requests, publish)
@@ -174,14 +187,14 @@ def run_daemon(
                 link=link,
                 clock=clock,
                 session_start_ns=clock.now_ns(),
-                epoch=time.time_ns(),
+                epoch=epoch,
                 publish=publish,
                 requests=requests,
                 allocate=memory.allocate if shares_rows else bytearray,
             )
-            log.about(session.name, surroundings.epoch)
+            log.about(session.name, epoch)
             site = build(session, surroundings)
-            lease = _lease(meeting, session, site, surroundings, node, link, log)
+            lease = _lease(meeting, session, site, surroundings, node, switch, log)
             other = OtherSession(session, lambda: site.channel.other_session)
             log.say(_greeting(session, site))
             for warning in meeting.warnings:
@@ -202,7 +215,10 @@ def run_daemon(
                 else nullcontext() as recorder,
                 _status(site, (recorder, metrics, other), _shown(lease), log, options),
                 lease,
-                LinkKeeper(site, node, link, clock, log),
+                nullcontext() if sealing is None else sealing,
+                LinkKeeper(site, node, switch, clock, log)
+                if sealing is None
+                else SealedLinkKeeper(site, sealing, clock, log),
                 _service_keeper(manager, site, log),
                 apply_real_time(session.real_time, cpu) as real_time,
             ):
@@ -226,6 +242,11 @@ def run_daemon(
     return EXIT_FAULT if site.failure is not None else 0
 
 
+def packets_node(meeting: Meeting) -> AbstractContextManager[ZenohNode | None]:
+    """Open the node for sealed packets, if the session has them."""
+    return nullcontext() if meeting.packets is None else closing(ZenohNode(meeting.packets))
+
+
 def _first_peer(identity: SiteId, meeting: Meeting) -> str | None:
     """Return the operator whom the link knows at first; none is heard before he has the lease."""
     remote_led = identity is SiteId.REMOTE and meeting.people
@@ -238,7 +259,7 @@ def _lease(
     site: Site,
     surroundings: Surroundings,
     node: ZenohNode,
-    link: ZenohLink,
+    switch: Switch,
     log: DaemonLog,
 ) -> LeaseKeeper | LeaseClaimant | AbstractContextManager[None]:
     """Return this site's side of the lease; a local site without operators has none."""
@@ -250,7 +271,7 @@ def _lease(
             site,
             epoch,
             surroundings.clock,
-            link,
+            switch,
             {person: node.subscriber(claim_key(name, person), _WORDS) for person in persons},
             rules_of(session, meeting.people),
             node.publisher(lease_key(name)),

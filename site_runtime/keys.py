@@ -25,6 +25,11 @@ def state_key(session_name: str, site: SiteId, operator: str | None = None) -> s
     return f"{_branch(session_name, site, operator)}/state"
 
 
+def offer_key(session_name: str, site: SiteId, operator: str | None = None) -> str:
+    """Key of what a site's run offers its peer for sealing their packets."""
+    return f"{_branch(session_name, site, operator)}/offer"
+
+
 def telemetry_key(session_name: str, site: SiteId, operator: str | None = None) -> str:
     """Key of a site's batches of rows."""
     return f"{_branch(session_name, site, operator)}/telemetry"

@@ -58,6 +58,22 @@ def _network(network: NetworkSettings) -> Iterator[Problem]:
             ABSENT,
             'is missing: security = "mtls" needs the folder that `farhand keys` makes',
         )
+    for key in ("packets_listen", "packets_connect"):
+        place = getattr(network, key)
+        if place is None:
+            continue
+        if not place.startswith("udp/"):
+            yield Problem(
+                f"network.{key}",
+                place,
+                "must be a udp/ endpoint: sealed packets need no other protection",
+            )
+        if network.security != "mtls":
+            yield Problem(
+                f"network.{key}",
+                place,
+                'needs security = "mtls": the certificates sign the keys that seal packets',
+            )
     if network.zenoh_config is not None:
         for key, given in (("security", network.security != "none"), ("router", network.router)):
             if given:

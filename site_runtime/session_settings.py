@@ -125,8 +125,15 @@ class NetworkSettings:
     security: Literal["none", "mtls"] = "none"
     keys: str | None = None
     router: Locator | None = None
+    packets_listen: Locator | None = None
+    packets_connect: Locator | None = None
     operator_silence_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
     allow_plaintext: bool = False
+
+    @property
+    def seals_packets(self) -> bool:
+        """Whether packets of poses go over UDP of their own, sealed."""
+        return self.packets_listen is not None or self.packets_connect is not None
 
 
 @dataclass(frozen=True, slots=True)

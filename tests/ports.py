@@ -3,8 +3,11 @@
 import socket
 
 
-def free_port() -> int:
-    """Return a TCP port that nobody has on this machine now; in a fresh namespace neither."""
-    with socket.socket() as probe:
+def free_port(kind: int = socket.SOCK_STREAM) -> int:
+    """Return a port that nobody has on this machine now; in a fresh namespace neither.
+
+    TCP, or UDP if `kind` is SOCK_DGRAM.
+    """
+    with socket.socket(type=kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -12,6 +12,7 @@ from site_runtime.keys import (
     SiteId,
     claim_key,
     lease_key,
+    offer_key,
     presence_keys,
     state_key,
     telemetry_key,
@@ -31,20 +32,25 @@ class Grant:
 
 
 def grants(
-    session_name: str, own: Identity, routed: bool, people: Sequence[Identity] = ()
+    session_name: str,
+    own: Identity,
+    routed: bool,
+    people: Sequence[Identity] = (),
+    sealed: bool = False,
 ) -> Mapping[Role | Identity, Grant]:
     """Return what the party `own` grants to others; who is not named gets nothing.
 
     With `routed` all meet at the router, and each of them knows nobody else. With `people` they,
-    each in his own name, are in the place of the local site.
+    each in his own name, are in the place of the local site. With `sealed` poses go another way,
+    by `packets_control`, and only what seals them goes here.
     """
     locals_: dict[Role | Identity, Identity] = {one: one for one in people}
     if not locals_:
         locals_[Role.LOCAL] = SITES[SiteId.LOCAL]
-    commands = {party: _commands(session_name, one) for party, one in locals_.items()}
+    commands = {party: _commands(session_name, one, sealed) for party, one in locals_.items()}
     rows = {party: _rows(session_name, one) for party, one in locals_.items()}
     remote_rows = _rows(session_name, SITES[SiteId.REMOTE])
-    answers = (*_poses(session_name, SITES[SiteId.REMOTE]), lease_key(session_name))
+    answers = (*_to_peer(session_name, SITES[SiteId.REMOTE], sealed), lease_key(session_name))
     shown = (*remote_rows, lease_key(session_name))
     if own == ROUTER:
         return {
@@ -66,7 +72,7 @@ def grants(
             **{party: Grant(commands[party], answers) for party in locals_},
             Role.OBSERVER: Grant(hears=shown),
         }
-    mine, told = _commands(session_name, own), _rows(session_name, own)
+    mine, told = _commands(session_name, own, sealed), _rows(session_name, own)
     if routed:
         return {Role.ROUTER: Grant(answers, (*mine, *told))}
     return {Role.REMOTE: Grant(answers, mine), Role.OBSERVER: Grant(hears=told)}
@@ -97,14 +103,32 @@ def access_control(
     }
 
 
-def _rules(grant: Grant) -> Iterator[tuple[str, dict[str, Any]]]:
+def packets_control(grant: Grant) -> dict[str, Any]:
+    """Return Zenoh's `access_control` for where sealed packets pass, and nothing else does.
+
+    It is for whoever comes by UDP, which shows no certificates: the seal tells whose a packet is.
+    """
+    said = _rules(grant, say=("put",), ask=("declare_subscriber",))
+    rules = [{"id": name, **rule} for name, rule in said]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [{"id": "packets", "link_protocols": ["udp"]}],
+        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": ["packets"]}],
+    }
+
+
+def _rules(
+    grant: Grant, say: tuple[str, ...] = _SAY, ask: tuple[str, ...] = _ASK
+) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, keys, says, asks in (
         ("says", grant.says, "ingress", "egress"),
         ("hears", grant.hears, "egress", "ingress"),
     ):
         if keys:
-            yield name, _rule(says, _SAY, keys)
-            yield f"{name}-asked", _rule(asks, _ASK, keys)
+            yield name, _rule(says, say, keys)
+            yield f"{name}-asked", _rule(asks, ask, keys)
 
 
 def _rule(flow: str, messages: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Any]:
@@ -116,14 +140,18 @@ def _rule(flow: str, messages: tuple[str, ...], keys: tuple[str, ...]) -> dict[s
     }
 
 
-def _poses(session_name: str, one: Identity) -> tuple[str, ...]:
+def _to_peer(session_name: str, one: Identity, sealed: bool) -> tuple[str, ...]:
     site = _site(one)
+    if sealed:
+        return offer_key(session_name, site, one.person), presence_keys(
+            session_name, site, one.person
+        )
     return state_key(session_name, site, one.person), presence_keys(session_name, site, one.person)
 
 
-def _commands(session_name: str, one: Identity) -> tuple[str, ...]:
-    poses = _poses(session_name, one)
-    return poses if one.person is None else (*poses, claim_key(session_name, one.person))
+def _commands(session_name: str, one: Identity, sealed: bool) -> tuple[str, ...]:
+    said = _to_peer(session_name, one, sealed)
+    return said if one.person is None else (*said, claim_key(session_name, one.person))
 
 
 def _rows(session_name: str, one: Identity) -> tuple[str, ...]:

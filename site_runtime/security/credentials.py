@@ -16,6 +16,7 @@ from typing import Any
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from site_runtime.security.identity import Identity, SecurityError, named
@@ -73,18 +74,15 @@ def load_credentials(folder: Path, identity: Identity) -> Credentials:
     place = credentials.folder
     require_private(place)
     require_private(place / KEY_FILE)
-    certificate = _certificate(place / CERTIFICATE_FILE)
-    authority = _certificate(place / AUTHORITY_FILE)
+    certificate = load_certificate(place / CERTIFICATE_FILE)
+    authority = load_certificate(place / AUTHORITY_FILE)
     try:
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature):
         raise SecurityError(
             f"{place / CERTIFICATE_FILE} is not signed by {place / AUTHORITY_FILE}"
         ) from None
-    try:
-        key = serialization.load_pem_private_key(_bytes(place / KEY_FILE), password=None)
-    except (ValueError, TypeError) as error:
-        raise SecurityError(f"{place / KEY_FILE} cannot be read: {error}") from error
+    key = load_key(place / KEY_FILE)
     if key.public_key() != certificate.public_key():
         raise SecurityError(f"{place / KEY_FILE} is not the key of {CERTIFICATE_FILE} beside it")
     now = datetime.now(UTC)
@@ -115,9 +113,8 @@ def read_credentials(folder: Path, identity: Identity) -> Credentials:
             f"{place} does not exist: `farhand keys SESSION.toml` makes the keys of {identity.name}"
             ", or copy that folder here from where they were made"
         )
-    certificate = _certificate(place / CERTIFICATE_FILE)
-    name = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    holder, generation = named(str(name[0].value) if name else "")
+    certificate = load_certificate(place / CERTIFICATE_FILE)
+    holder, generation = named(common_name_of(certificate))
     if holder != identity:
         raise SecurityError(
             f"{place / CERTIFICATE_FILE} is the certificate of {holder.name}, not of "
@@ -132,6 +129,12 @@ def read_credentials(folder: Path, identity: Identity) -> Credentials:
         certificate.fingerprint(hashes.SHA256()).hex(),
         hosts_of(certificate),
     )
+
+
+def common_name_of(certificate: x509.Certificate) -> str:
+    """Return the name in a certificate, "" if it has none."""
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else ""
 
 
 def hosts_of(certificate: x509.Certificate) -> tuple[str, ...]:
@@ -190,11 +193,23 @@ def require_private(path: Path) -> None:
         )
 
 
-def _certificate(path: Path) -> x509.Certificate:
+def load_certificate(path: Path) -> x509.Certificate:
+    """Read a certificate; SecurityError if there is none."""
     try:
         return x509.load_pem_x509_certificate(_bytes(path))
     except ValueError as error:
         raise SecurityError(f"{path} is no certificate: {error}") from error
+
+
+def load_key(path: Path) -> ec.EllipticCurvePrivateKey:
+    """Read a private key; SecurityError if there is none of the kind that farhand makes."""
+    try:
+        key = serialization.load_pem_private_key(_bytes(path), password=None)
+    except (ValueError, TypeError) as error:
+        raise SecurityError(f"{path} cannot be read: {error}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise SecurityError(f"{path} is no key on an elliptic curve")
+    return key
 
 
 def _bytes(path: Path) -> bytes:

@@ -6,8 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from channel.zenoh_link import ZenohSettings
-from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
-from site_runtime.security.access import access_control, grants
+from site_runtime.keys import (
+    SiteId,
+    claim_key,
+    lease_key,
+    offer_key,
+    state_key,
+    telemetry_key,
+)
+from site_runtime.security.access import Grant, access_control, grants, packets_control
 from site_runtime.security.credentials import (
     AUTHORITY_FILE,
     CERTIFICATE_FILE,
@@ -25,6 +32,7 @@ from site_runtime.security.identity import (
     Role,
     SecurityError,
 )
+from site_runtime.security.offer import MOST_OFFER_BYTES
 from site_runtime.session import Session
 
 MOST_STATE_BYTES = 512
@@ -43,6 +51,8 @@ class Meeting:
     warnings: tuple[str, ...]
     people: tuple[Identity, ...] = ()
     """Who may be in the place of the local site; nobody in particular if empty."""
+    packets: ZenohSettings | None = None
+    """The same of a node of its own for sealed packets; None if poses need none."""
 
     @property
     def person(self) -> str | None:
@@ -166,7 +176,7 @@ def _meet(
         _require_certificates(listens, dials)
         configuration |= _mutual_tls(session, credentials, people)
     if own == ROUTER:
-        configuration |= _relay(session, people)
+        configuration |= _relay(session, people, packets=not network.seals_packets)
     elif network.router is not None:
         # peers of regions of their own, not clients: those cannot start before the router does
         configuration["region_name"] = _region(own).value
@@ -187,7 +197,51 @@ def _meet(
         config_file=network.zenoh_config,
         configuration=configuration,
     )
-    return Meeting(settings, credentials, tuple(warnings), people)
+    return Meeting(settings, credentials, tuple(warnings), people, _packets(session, own, people))
+
+
+def _packets(session: Session, own: Identity, people: Sequence[Identity]) -> ZenohSettings | None:
+    """Return how a party meets the others for sealed packets, if there are any.
+
+    By a node of its own: who comes by UDP shows no certificate, and shall share nothing with what
+    certificates protect, not even a routing table.
+    """
+    network = session.network
+    if not network.seals_packets or own.role is Role.OBSERVER:
+        return None
+    routed = network.router is not None
+    remote = SITES[SiteId.REMOTE]
+    listens = own == (ROUTER if routed else remote)
+    key = "packets_listen" if listens else "packets_connect"
+    place = getattr(network, key)
+    if place is None:
+        raise SecurityError(
+            f"network.{key} is missing: of sealed packets {own.name} "
+            f'{"listens there" if listens else "dials there"}, such as "udp/192.168.1.2:7449"'
+        )
+    if not listens and Endpoint(f"network.{key}", place).unspecified:
+        raise SecurityError(f'network.{key} = "{place}" is no address that could be dialled')
+    locals_ = [state_key(session.name, SiteId.LOCAL, one.person) for one in people]
+    locals_ = locals_ or [state_key(session.name, SiteId.LOCAL)]
+    remotes = [state_key(session.name, SiteId.REMOTE)]
+    configuration: dict[str, Any] = {}
+    if own == ROUTER:
+        granted = Grant((*locals_, *remotes), (*locals_, *remotes))
+        configuration |= _relay(session, people, packets=True, others=False)
+    elif own == remote:
+        granted = Grant(tuple(locals_), tuple(remotes))
+    else:
+        granted = Grant(tuple(remotes), (state_key(session.name, SiteId.LOCAL, own.person),))
+    if routed and own != ROUTER:
+        configuration["region_name"] = _region(own).value
+    return ZenohSettings(
+        listen=(place,) if listens else (),
+        connect=() if listens else (place,),
+        lease_ms=round(network.lease_s * 1e3),
+        open_timeout_ms=round(network.open_timeout_s * 1e3),
+        tier=1 if listens else 0,
+        configuration=configuration | {"access_control": packets_control(granted)},
+    )
 
 
 def _people(credentials: Credentials) -> tuple[Identity, ...]:
@@ -253,7 +307,8 @@ def _mutual_tls(
 ) -> dict[str, Any]:
     key, certificate = credentials.file(KEY_FILE), credentials.file(CERTIFICATE_FILE)
     routed = session.network.router is not None
-    granted = grants(session.name, credentials.identity, routed, people)
+    sealed = session.network.seals_packets
+    granted = grants(session.name, credentials.identity, routed, people, sealed)
     return {
         "transport/link/tls": {
             "root_ca_certificate": credentials.file(AUTHORITY_FILE),
@@ -270,23 +325,28 @@ def _mutual_tls(
     }
 
 
-def _relay(session: Session, people: Sequence[Identity]) -> Mapping[str, Any]:
-    """Return what makes a node the relay of a session, with its limits on size and rate."""
+def _relay(
+    session: Session, people: Sequence[Identity], *, packets: bool, others: bool = True
+) -> Mapping[str, Any]:
+    """Return what makes a node a relay, of packets or all else, with limits on size and rate."""
     persons = [one.person for one in people if one.person is not None]
     parties: list[tuple[SiteId, str | None]] = [(SiteId.LOCAL, one) for one in persons]
     parties = [*(parties or [(SiteId.LOCAL, None)]), (SiteId.REMOTE, None)]
     states = [state_key(session.name, *party) for party in parties]
-    rows = [telemetry_key(session.name, *party) for party in parties]
-    claims = [claim_key(session.name, one) for one in persons]
-    sizes = [
-        ("state", states, MOST_STATE_BYTES),
-        ("telemetry", rows, MOST_TELEMETRY_BYTES),
-        ("lease", [lease_key(session.name)], MOST_LEASE_BYTES),
-    ]
-    if claims:
-        sizes.append(("claim", claims, MOST_STATE_BYTES))
+    sizes: list[tuple[str, list[str], int]] = []
+    if packets:
+        sizes.append(("state", states, MOST_STATE_BYTES))
+    else:
+        offers = [offer_key(session.name, *party) for party in parties]
+        sizes.append(("offer", offers, MOST_OFFER_BYTES))
+    if others:
+        rows = [telemetry_key(session.name, *party) for party in parties]
+        sizes.append(("telemetry", rows, MOST_TELEMETRY_BYTES))
+        sizes.append(("lease", [lease_key(session.name)], MOST_LEASE_BYTES))
+        if claims := [claim_key(session.name, one) for one in persons]:
+            sizes.append(("claim", claims, MOST_STATE_BYTES))
     regions = (Role.LOCAL, Role.REMOTE, Role.OBSERVER)
-    return {
+    relay: dict[str, Any] = {
         "mode": "router",
         "gateway": {"south": [{"filters": [{"region_names": [role.value]}]} for role in regions]},
         "low_pass_filter": [
@@ -299,16 +359,18 @@ def _relay(session: Session, people: Sequence[Identity]) -> Mapping[str, Any]:
             }
             for name, keys, size in sizes
         ],
-        "downsampling": [
+    }
+    if packets:
+        # not of telemetry, whose batches come in bursts and must all arrive
+        relay["downsampling"] = [
             {
-                # not of telemetry, whose batches come in bursts and must all arrive
                 "id": "state-rate",
                 "flows": ["ingress"],
                 "messages": ["put"],
                 "rules": [{"key_expr": key, "freq": most_relayed_hz(session)} for key in states],
             }
-        ],
-    }
+        ]
+    return relay
 
 
 def _wide_area(endpoint: Endpoint) -> Endpoint:

@@ -8,6 +8,7 @@ import pytest
 
 from channel.link import Link, TappedLink
 from channel.memory_link import memory_links
+from channel.sealed_link import PacketKeys, SealedLink
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from tests.ports import free_port
 
@@ -33,13 +34,20 @@ def free_endpoint() -> str:
     return f"tcp/127.0.0.1:{free_port()}"
 
 
-@pytest.fixture(params=["memory", "tapped", "zenoh"])
+@pytest.fixture(params=["memory", "tapped", "sealed", "zenoh"])
 def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
     if request.param == "memory":
         yield Pair(*memory_links(CAPACITY))
         return
     if request.param == "tapped":
         yield Pair(*(TappedLink(link, lambda _: None) for link in memory_links(CAPACITY)))
+        return
+    if request.param == "sealed":
+        ends = [SealedLink(link, link.peer_present) for link in memory_links(CAPACITY)]
+        there, back = bytes(36), bytes(range(36))
+        for end, ways in zip(ends, ((there, back), (back, there)), strict=True):
+            end.use(PacketKeys(*ways))
+        yield Pair(*ends)
         return
     endpoint = free_endpoint()
     listening = ZenohNode(ZenohSettings(listen=(endpoint,)))

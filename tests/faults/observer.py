@@ -1,7 +1,8 @@
 """A process that hears both sites' telemetry and keeps it in a file, and that file's reader.
 
 It listens and the sites connect to it, so a new run is heard from its first rows on (a
-`farhand.feed.Feed` dials, and may come a second late). It ends with its standard input.
+`farhand.feed.Feed` dials, and may come a second late); with certificates it dials, as an observer's
+are good for nothing else. It ends with its standard input.
 """
 
 import select
@@ -13,7 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from channel.zenoh_link import ZenohNode, ZenohSettings
+from farhand.feed import DASHBOARD
 from site_runtime.keys import SiteId, telemetry_key
+from site_runtime.security.identity import Identity
+from site_runtime.security.network import meet_as_observer
+from site_runtime.session import load_session
 from telemetry.rows import RowArray
 from telemetry.stream import decode_batch
 
@@ -63,10 +68,10 @@ class Recording:
         self._read += place
 
 
-def observe(endpoint: str, name: str, path: Path) -> None:
+def observe(settings: ZenohSettings, name: str, path: Path) -> None:
     """Write all telemetry of session `name` to `path` until standard input ends."""
     with (
-        closing(ZenohNode(ZenohSettings(listen=(endpoint,), lease_ms=LEASE_MS))) as node,
+        closing(ZenohNode(settings)) as node,
         path.open("wb") as file,
     ):
         subscriptions = [node.subscriber(telemetry_key(name, site), 4096) for site in SiteId]
@@ -79,5 +84,14 @@ def observe(endpoint: str, name: str, path: Path) -> None:
             file.flush()
 
 
+def main(endpoint: str, name: str, path: str, session: str | None = None) -> None:
+    """Listen at an endpoint, or, with a session whose parties have certificates, dial it."""
+    settings = ZenohSettings(listen=(endpoint,), lease_ms=LEASE_MS)
+    if session is not None:
+        observer = Identity(DASHBOARD)
+        settings = meet_as_observer(load_session(session), observer, [endpoint]).settings
+    observe(settings, name, Path(path))
+
+
 if __name__ == "__main__":
-    observe(sys.argv[1], sys.argv[2], Path(sys.argv[3]))
+    main(*sys.argv[1:])

@@ -22,6 +22,7 @@ def write_session(
     operator: dict[str, object] | None = None,
     profile: str | None = None,
     channel: dict[str, object] | None = None,
+    network: dict[str, object] | None = None,
 ) -> Path:
     """Write the session file of one site and return its path; endpoints come by command line.
 
@@ -44,6 +45,7 @@ def write_session(
     else:
         document["network"]["profile"] = profile
     document["network"]["allow_plaintext"] = True  # namespaces of our own
+    document["network"] |= network or {}
     if router is not None:
         document["network"]["router"] = router
     for contact in ("environment", "obstacles", "null_space", "sub_tasks"):

@@ -13,7 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from farhand.feed import DASHBOARD
 from site_runtime.keys import SiteId
+from site_runtime.security.authority import create_authority
+from site_runtime.security.identity import Identity
 from site_runtime.session import Session, load_session
 from site_runtime.supervisor import State
 from telemetry.rows import RowArray, row_dtype
@@ -59,7 +62,8 @@ class SitePair:
 
     On the network each site has its own side, and an observer there, so that telemetry never
     crosses what is impaired; a router is on the local side. All are processes of one machine: all
-    stamps are CLOCK_MONOTONIC.
+    stamps are CLOCK_MONOTONIC. Over "tls" all show certificates; "sealed" is that, with packets
+    sealed over UDP.
     """
 
     def __init__(
@@ -75,10 +79,12 @@ class SitePair:
         channel: dict[str, object] | None = None,
     ) -> None:
         self._folder = folder
-        self._protocol = protocol
+        self._sealed = protocol == "sealed"
+        self._protocol = "tls" if self._sealed else protocol
         self._profile = profile
         self._channel = channel
         self._network = network
+        self._security = self._make_keys() if self._protocol == "tls" else None
         self._operator = operator
         self._orphan_s = orphan_s
         self._endpoints = {site: self._free_endpoint(site) for site in BOTH}
@@ -90,15 +96,19 @@ class SitePair:
         if wall_clock.COMPILER is not None:
             self.clocks = {site: WallClock(folder, site.label) for site in BOTH}
         self.files = {site: self.write_session(site) for site in BOTH}
-        # one a side, or one for all
+        # one a side, or one for all; with certificates it dials the site of its side
+        dialled = self._security is not None
         sides = BOTH if network is not None else (LOCAL,)
-        self._observer_endpoints = {site: f"tcp/127.0.0.1:{free_port()}" for site in sides}
+        self._observer_endpoints = {
+            site: self._endpoints[site] if dialled else f"tcp/127.0.0.1:{free_port()}"
+            for site in sides
+        }
         recordings = {site: folder / f"observed_{site.label}.rows" for site in sides}
         self._observers = [
             Companion(
                 self._command(
                     site, "tests.faults.observer", self._observer_endpoints[site], NAME,
-                    str(recordings[site]),
+                    str(recordings[site]), *([str(self.files[site])] if dialled else ()),
                 )
             )
             for site in sides
@@ -123,6 +133,7 @@ class SitePair:
             profile=self._profile,
             channel=self._channel,
             operator=self._operator,
+            network=self._security,
             **changes,  # type: ignore[arg-type]
         )
 
@@ -255,7 +266,7 @@ class SitePair:
 
     def _start(self, site: SiteId, endpoint: str, dial_peer: bool) -> Daemon:
         observer = self._observer_endpoints.get(site, self._observer_endpoints[LOCAL])
-        dialled = [observer]
+        dialled = [] if self._security is not None else [observer]
         if self._router_endpoint is not None:
             dialled.append(self._router_endpoint)
         elif site is LOCAL or dial_peer:
@@ -280,6 +291,21 @@ class SitePair:
         daemon = Daemon(site, process, endpoint, log)
         self.all.append(daemon)
         return daemon
+
+    def _make_keys(self) -> dict[str, object]:
+        """Make everybody's keys; return what the session file says of them."""
+        hosts = ["127.0.0.1"]
+        if self._network is not None:
+            hosts = [self._network.address(site) for site in BOTH]
+        authority = create_authority(self._folder / "keys", NAME)
+        for name in ("local", "remote", DASHBOARD):
+            authority.issue(Identity(name), hosts)
+        security: dict[str, object] = {"security": "mtls", "keys": str(authority.folder)}
+        if self._sealed:
+            address = hosts[REMOTE % len(hosts)]
+            place = f"udp/{address}:{free_port()}"
+            security |= {"packets_listen": place, "packets_connect": place}
+        return security
 
     def _state_folder(self, site: SiteId) -> Path:
         return self._folder / f"state_{site.label}"

@@ -29,7 +29,7 @@ def good(seen: Seen) -> bool:
     )
 
 
-@pytest.mark.parametrize(("protocol", "routed"), [("udp", False), ("tcp", True)])
+@pytest.mark.parametrize(("protocol", "routed"), [("udp", False), ("sealed", False), ("tcp", True)])
 def test_an_outage_of_a_lossy_network_leads_to_hold_and_back(protocol: str, routed: bool) -> None:
     told = []
     for seed in range(TRIES):

@@ -43,7 +43,7 @@ NETWORKS = (
     Network("50 ± 5 ms, 0.1 % lost", "wan", Impairment(0.05, 0.005, loss=0.001)),
     Network("50 ± 20 ms, 2 % lost", "lossy", Impairment(0.05, 0.02, loss=0.02)),
 )
-PROTOCOLS = ("tcp", "udp")
+PROTOCOLS = ("tcp", "udp", "tls", "sealed")
 
 
 @dataclass

@@ -1,6 +1,7 @@
 """A session whose parties show certificates: its keys, its daemons, its relay, and intruders."""
 
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -88,7 +89,7 @@ def tls(folder: Path | None, trust: Path | None = None) -> dict[str, object]:
 class SecuredPair:
     """Both daemons, with a relay or without, and a dashboard's feed."""
 
-    def __init__(self, folder: Path, relay: str | None = None) -> None:
+    def __init__(self, folder: Path, relay: str | None = None, sealed: bool = False) -> None:
         self.folder = folder
         self.keys = folder / "keys"
         self.authority = make_keys(self.keys)
@@ -102,6 +103,9 @@ class SecuredPair:
         if relay is not None:
             self.relay = f"{relay}/127.0.0.1:{free_port()}"
             network = {"router": self.relay}
+        if sealed:
+            self.packets = f"udp/127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
+            network |= {"packets_listen": self.packets, "packets_connect": self.packets}
         self.file = write_session(folder / "session.toml", self.keys, **network)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._feed: Feed | None = None
@@ -173,6 +177,10 @@ class SecuredPair:
         assert self._feed is not None
         for batch, _ in self._feed.receive():
             self._newest[SiteId(batch.site)] = batch.rows
+
+    def state(self, site: SiteId) -> State:
+        """The state of a site by the newest row that came."""
+        return State(self._newest[site]["state"][-1])
 
     def rejected(self, site: SiteId) -> int:
         """How many packets a site has refused, by rows made from now on."""

@@ -49,7 +49,7 @@ SILENCE_S = 2.0
 class Robot:
     """A remote site that records, its relay, operators' local sites, and what `list` says."""
 
-    def __init__(self, folder: Path, *, routed: bool) -> None:
+    def __init__(self, folder: Path, *, routed: bool, **packets: object) -> None:
         self.folder = folder
         self.keys = folder / "keys"
         make_keys(self.keys, PARTIES)
@@ -63,7 +63,11 @@ class Robot:
                 "local_listen": f"tls/127.0.0.1:{free_port()}",
             }
         self.file = write_session(
-            folder / "session.toml", self.keys, operator_silence_s=SILENCE_S, **network
+            folder / "session.toml",
+            self.keys,
+            operator_silence_s=SILENCE_S,
+            **network,
+            **packets,
         )
         text = self.file.read_text(encoding="utf-8")
         self.file.write_text(

@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 
 from channel.zenoh_link import ZenohSettings
-from site_runtime.keys import SiteId, claim_key, lease_key, state_key, telemetry_key
+from site_runtime.keys import (
+    SiteId,
+    claim_key,
+    lease_key,
+    offer_key,
+    state_key,
+    telemetry_key,
+)
 from site_runtime.security.access import access_control, grants
 from site_runtime.security.authority import Authority, create_authority
 from site_runtime.security.endpoints import Endpoint
@@ -150,7 +157,12 @@ def test_a_certificate_near_its_end_is_told(tmp_path: Path, authority: Authority
 def test_the_digest_knows_nothing_of_security(tmp_path: Path) -> None:
     digests = {
         session(tmp_path, network).digest
-        for network in ("", SECURE, MTLS + 'router = "quic/relay.example:7447"')
+        for network in (
+            "",
+            SECURE,
+            MTLS + 'router = "quic/relay.example:7447"',
+            MTLS + 'packets_connect = "udp/robot.example:7449"',
+        )
     }
     assert len(digests) == 1
 
@@ -166,6 +178,9 @@ def test_the_digest_knows_nothing_of_security(tmp_path: Path) -> None:
         ),
         ('security = "tls"', ["network.security"]),
         ('router = "7447"', ["network.router", "Zenoh endpoint"]),
+        (MTLS + 'packets_listen = "tcp/127.0.0.1:1"', ["network.packets_listen", "udp/"]),
+        (MTLS + 'packets_connect = "quic/127.0.0.1:1"', ["network.packets_connect", "udp/"]),
+        ('packets_connect = "udp/127.0.0.1:1"', ["network.packets_connect", '"mtls"']),
     ],
 )
 def test_contradictions_of_the_file(tmp_path: Path, network: str, words: list[str]) -> None:
@@ -208,13 +223,15 @@ def test_a_party_whose_names_are_all_revoked_has_no_subject() -> None:
         assert subject["cert_common_names"]
 
 
+@pytest.mark.parametrize("sealed", [False, True])
 @pytest.mark.parametrize("routed", [False, True])
-def test_nobody_says_what_is_another_partys(routed: bool) -> None:
+def test_nobody_says_what_is_another_partys(routed: bool, sealed: bool) -> None:
     """Of every grant of every party: poses only of their site, and to nobody but the other."""
     for own in (*SITES.values(), EYE, *([ROUTER] if routed else [])):
-        for role, grant in grants("s", own, routed).items():
+        for role, grant in grants("s", own, routed, sealed=sealed).items():
             for site in SiteId:
-                poses, rows = state_key("s", site), telemetry_key("s", site)
+                rows = telemetry_key("s", site)
+                poses = offer_key("s", site) if sealed else state_key("s", site)
                 speaks = role is Role.ROUTER or role == site.label
                 assert speaks or poses not in grant.says
                 assert speaks or rows not in grant.says
@@ -286,6 +303,96 @@ def test_the_keys_of_a_nameless_local_site_end_with_the_first_operator(
     shutil.rmtree(authority.folder / PEOPLE[0].name)  # on another machine
     with pytest.raises(SecurityError, match="not obeyed any more"):
         meet_as_site(session(tmp_path, SECURE), LOCAL)
+
+
+LISTEN, CONNECT = 'packets_listen = "udp/0.0.0.0:7449"\n', 'packets_connect = "udp/10.0.0.1:7449"\n'
+ROUTED = MTLS + 'router = "quic/127.0.0.1:7447"\n'
+
+
+@pytest.mark.parametrize("routed", [False, True])
+def test_sealed_packets_have_a_node_of_their_own(
+    tmp_path: Path, authority: Authority, routed: bool
+) -> None:
+    loaded = session(tmp_path, (ROUTED if routed else SECURE) + LISTEN + CONNECT)
+    assert meet_as_observer(loaded, EYE, ["tls/127.0.0.1:7447"]).packets is None
+    meetings = {site: meet_as_site(loaded, site) for site in SiteId}
+    for site, meeting in meetings.items():
+        assert meeting.packets is not None
+        listens = site is REMOTE and not routed
+        assert meeting.packets.listen == (("udp/0.0.0.0:7449",) if listens else ())
+        assert meeting.packets.connect == (() if listens else ("udp/10.0.0.1:7449",))
+        assert meeting.packets.configuration.get("region_name") == (site.label if routed else None)
+        control = meeting.packets.configuration["access_control"]
+        assert control["default_permission"] == "deny"
+        assert [subject["link_protocols"] for subject in control["subjects"]] == [["udp"]]
+        keys = {
+            (rule["id"], key, message)
+            for rule in control["rules"]
+            for key in rule["key_exprs"]
+            for message in rule["messages"]
+        }
+        own, peer = state_key("demo", site), state_key("demo", site.peer)
+        assert keys == {
+            ("says", peer, "put"),
+            ("says-asked", peer, "declare_subscriber"),
+            ("hears", own, "put"),
+            ("hears-asked", own, "declare_subscriber"),
+        }
+        assert "udp" not in str(meeting.settings)  # nor anything of them on the other
+        assert f"'{own}'" not in str(meeting.settings.configuration)
+        assert offer_key("demo", site) in str(meeting.settings.configuration)
+        assert meeting.warnings == ()  # sealed: not in the clear
+    if routed:
+        relay = meet_as_router(loaded)
+        assert relay.packets is not None
+        assert relay.packets.listen == ("udp/0.0.0.0:7449",)
+        assert relay.packets.configuration["mode"] == "router"
+        assert "telemetry" not in str(relay.packets.configuration)
+        assert f"'{state_key('demo', LOCAL)}'" not in str(
+            relay.settings.configuration["access_control"]
+        )
+
+
+@pytest.mark.parametrize(
+    ("network", "who", "key"),
+    [
+        (SECURE + LISTEN, LOCAL, "packets_connect"),
+        (SECURE + CONNECT, REMOTE, "packets_listen"),
+        (ROUTED + LISTEN, REMOTE, "packets_connect"),
+        (ROUTED + CONNECT, None, "packets_listen"),
+    ],
+)
+def test_who_seals_packets_says_where_they_go(
+    tmp_path: Path, authority: Authority, network: str, who: SiteId | None, key: str
+) -> None:
+    def meet(loaded: Session) -> object:
+        return meet_as_router(loaded) if who is None else meet_as_site(loaded, who)
+
+    with pytest.raises(SecurityError, match=rf"network\.{key} is missing"):
+        meet(session(tmp_path, network))
+    given = LISTEN if key == "packets_listen" else CONNECT
+    meet(session(tmp_path, network + given))
+
+
+def test_packets_are_not_dialled_at_every_address(tmp_path: Path, authority: Authority) -> None:
+    with pytest.raises(SecurityError, match="packets_connect"):
+        meet_as_site(session(tmp_path, SECURE + LISTEN.replace("listen", "connect")), LOCAL)
+
+
+def test_operators_hear_and_say_sealed_packets_each_in_his_own_name(
+    tmp_path: Path, authority: Authority
+) -> None:
+    for one in PEOPLE[:2]:
+        authority.issue(one, ["127.0.0.1"])
+    loaded = session(tmp_path, SECURE + LISTEN + CONNECT)
+    bob = meet_as_site(loaded, LOCAL, operator="bob").packets
+    remote = meet_as_site(loaded, REMOTE).packets
+    assert bob is not None
+    assert remote is not None
+    assert "alice" not in str(bob.configuration)
+    for one in ("alice", "bob"):
+        assert state_key("demo", LOCAL, one) in str(remote.configuration)
+    assert state_key("demo", LOCAL) not in str(remote.configuration)
 
 
 def test_the_demo_stays_as_it_is() -> None:
