@@ -9,7 +9,8 @@ demo: $(READY)  ## both sites on this machine, with the dashboard, until Ctrl-C
 	$(BIN)/farhand demo $(ARGS)
 
 test: $(READY)  ## the whole test suite: on all cores, then what must have the machine to itself
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not processes and not viewer" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not patient and not processes and not viewer" $(ARGS) || [ $$? = 5 ]
+	$(BIN)/python -m pytest -n auto --dist worksteal -m patient $(ARGS) || [ $$? = 5 ]
 	$(BIN)/python -m pytest -m "processes or viewer" $(ARGS) || [ $$? = 5 ]  # 5: no test is of this kind
 
 lint: $(READY)  ## style, types, import directions

@@ -58,6 +58,12 @@ class Counters:
     """Packets that injection released after a newer one."""
     peer_restarts: int = 0
     rejected: Counter[Reject] = field(default_factory=Counter)
+    rejected_total: int = 0
+
+    def reject(self, reason: Reject) -> None:
+        """Count one that was refused."""
+        self.rejected[reason] += 1
+        self.rejected_total += 1
 
 
 class Channel:
@@ -290,11 +296,11 @@ class Channel:
         try:
             packet = decode(data)
         except PacketError as error:
-            self.counters.rejected[error.reason] += 1
+            self.counters.reject(error.reason)
             return
         reason = self._foreign(packet, now_ns)
         if reason is not None:
-            self.counters.rejected[reason] += 1
+            self.counters.reject(reason)
             return
         copies = self._injection.copies()
         if copies == 0:
@@ -342,7 +348,7 @@ class Channel:
             elif packet.stamp_ns <= newest.stamp_ns:
                 reason = Reject.STAMP
             if reason is not None:
-                self.counters.rejected[reason] += 1
+                self.counters.reject(reason)
                 return
             self.counters.lost += gap - 1
         self.counters.received += 1

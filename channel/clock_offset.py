@@ -39,11 +39,13 @@ class ClockOffset:
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
         """Return the estimate with its uncertainty at `now_ns`; None before the first exchange."""
-        if self._updated_ns is None:
+        lower_ns, upper_ns, updated_ns = self._lower_ns, self._upper_ns, self._updated_ns
+        if updated_ns is None:
             return None
-        drift_ns = _drift_ns(now_ns - self._updated_ns)
-        half_gap_ns = (self._upper_ns - self._lower_ns + 1) // 2
-        return OffsetEstimate((self._lower_ns + self._upper_ns) // 2, half_gap_ns + drift_ns)
+        uncertainty_ns = (upper_ns - lower_ns + 1) // 2
+        if now_ns != updated_ns:
+            uncertainty_ns += _drift_ns(now_ns - updated_ns)
+        return OffsetEstimate((lower_ns + upper_ns) // 2, uncertainty_ns)
 
     def update(
         self, echo_stamp_ns: int, echo_arrival_ns: int, stamp_ns: int, arrival_ns: int

@@ -84,7 +84,7 @@ class LinkKeeper(Keeper):
 
     def _answered(self, now_ns: int) -> bool:
         channel = self._site.channel
-        refused, before = channel.counters.rejected.total(), self._refused
+        refused, before = channel.counters.rejected_total, self._refused
         self._refused = refused
         if refused != before or (channel.peer_taken and _recent(channel.heard_ns, now_ns)):
             return True

@@ -1,7 +1,7 @@
 """One site: its tick, and the run that carries it."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from math import dist, nan
@@ -9,7 +9,7 @@ from math import dist, nan
 import numpy as np
 import numpy.typing as npt
 
-from channel.channel import Channel, PeerSample
+from channel.channel import Channel, Counters, PeerSample
 from channel.clock_offset import OffsetEstimate
 from channel.packet import Reject
 from hardware.interface import Device, DeviceState
@@ -365,7 +365,9 @@ class Site:
             command.sub_task_error_rad_s,
             counters.lost,
             counters.late,
-            self._count_rejected(counters.rejected),
+            self._rejected
+            if counters.rejected_total == self._rejected_total
+            else self._count_rejected(counters),
             self.missed,
         )
 
@@ -391,10 +393,8 @@ class Site:
                 ),
             )
 
-    def _count_rejected(self, rejected: Mapping[Reject, int]) -> list[int]:
-        """Return the counts by reason, in the order of `Reject`; a new list only if one grew."""
-        total = sum(rejected.values())
-        if total != self._rejected_total:
-            self._rejected_total = total
-            self._rejected = [min(rejected.get(reason, 0), _MOST_COUNTED) for reason in Reject]
+    def _count_rejected(self, counters: Counters) -> list[int]:
+        """Return the counts by reason anew, in the order of `Reject`."""
+        self._rejected_total = counters.rejected_total
+        self._rejected = [min(counters.rejected[reason], _MOST_COUNTED) for reason in Reject]
         return self._rejected

@@ -137,6 +137,12 @@ class TelemetryStream:
         What would not fit stays at the most that a column holds. A row whose assignment raises (a
         wrong shape) is not counted.
         """
+        # _MOST is all ones: whatever is greater shows in any sum of bits
+        if read_ns | step_ns | write_ns | sent_ns | lost | late | missed > _MOST:
+            read_ns, step_ns, write_ns, sent_ns, lost, late, missed = (
+                min(number, _MOST)
+                for number in (read_ns, step_ns, write_ns, sent_ns, lost, late, missed)
+            )
         count = self._count
         self._pack_row(
             self._places[count % self._capacity],
@@ -145,10 +151,10 @@ class TelemetryStream:
             time_ns,
             lateness_ns,
             duration_ns,
-            read_ns if read_ns < _MOST else _MOST,
-            step_ns if step_ns < _MOST else _MOST,
-            write_ns if write_ns < _MOST else _MOST,
-            sent_ns if sent_ns < _MOST else _MOST,
+            read_ns,
+            step_ns,
+            write_ns,
+            sent_ns,
             state,
             peer_state,
             requests,
@@ -173,10 +179,10 @@ class TelemetryStream:
             loop_bound_s,
             certified_round_trip_s,
             sub_task_error_rad_s,
-            lost if lost < _MOST else _MOST,
-            late if late < _MOST else _MOST,
+            lost,
+            late,
             *rejected,
-            missed if missed < _MOST else _MOST,
+            missed,
         )
         self._count = count + 1
         self._count_row(self._count)

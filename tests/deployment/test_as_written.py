@@ -59,7 +59,7 @@ RECORDED = 100_000  # bytes of a site's rows: seconds
 def _machines(test: Callable[..., None]) -> Callable[..., None]:
     reason = namespace.refusal()
     test = pytest.mark.skipif(reason is not None, reason=str(reason))(test)
-    return pytest.mark.processes(test)
+    return pytest.mark.patient(test)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from tests.loopback.secured import make_keys, write_session
 from tests.ports import free_port
 from tests.running import farhand, running
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 
 ROOT = Path(__file__).parents[2]
 

@@ -126,7 +126,7 @@ def complete(robot: dict[str, object], table: str, name: str) -> None:
     assert re.fullmatch(r"[0-9.]+ ms", cells[6])
 
 
-@pytest.mark.processes
+@pytest.mark.patient
 def test_daemons_without_certificates_by_session_file_and_by_endpoint(tmp_path: Path) -> None:
     remote, local = free_port(), free_port()
     text = DEMO.read_text(encoding="utf-8")
@@ -142,7 +142,7 @@ def test_daemons_without_certificates_by_session_file_and_by_endpoint(tmp_path: 
             complete(*shown(place), name="demo")
 
 
-@pytest.mark.processes
+@pytest.mark.patient
 def test_daemons_with_certificates_through_a_router(tmp_path: Path) -> None:
     with closing(SecuredPair(tmp_path, relay="quic")) as pair:
         pair.start("router", "remote", "local")

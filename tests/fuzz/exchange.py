@@ -59,7 +59,7 @@ def used(sample: PeerSample | None) -> tuple[object, ...] | None:
 def knowledge(channel: Channel) -> dict[str, object]:
     """All that a channel tells of its peer, but for what it rejected, and for whose sake."""
     told = {name: getattr(channel, name) for name in _TOLD}
-    return told | {"counters": replace(channel.counters, rejected=Counter())}
+    return told | {"counters": replace(channel.counters, rejected=Counter(), rejected_total=0)}
 
 
 class Exchange:

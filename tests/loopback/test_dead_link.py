@@ -16,7 +16,7 @@ from tests.loopback.secured import NAME, until, write_session
 from tests.ports import free_port
 from tests.running import running
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 ABSENT_S = 2.5 * (UNHEARD_S + ASK_S)
 
 

@@ -31,7 +31,7 @@ from tests.loopback.secured import (
 )
 from tests.ports import free_port
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 PARTIES = tuple(
     Identity(name)
     for name in (
@@ -242,6 +242,7 @@ def test_one_holds_it_and_it_goes_from_hand_to_hand_only_by_right(robot: Robot) 
 
         # taken by a supervisor
         robot.start_operator("carol")
+        until(lambda: "refused, bob holds it" in robot.text("carol"), "carol told")
         assert robot.farhand("lease", "take", session, "--as", "carol") == (0, "taken\n")
         ear.until("carol", "ENGAGED")
 

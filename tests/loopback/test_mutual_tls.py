@@ -28,7 +28,7 @@ from tests.loopback.secured import (
 )
 from tests.ports import free_port
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
 REFUSED_S = 1.0  # longer than a handshake on a crowded machine; Zenoh goes on trying
 

@@ -16,7 +16,7 @@ from site_runtime.link_keeper import ASK_S, UNHEARD_S
 from site_runtime.security.network import meet_as_site
 from tests.loopback.secured import FORGED, NAME, RATE_HZ, ROOT, SecuredPair, tls, until
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
 
 

@@ -47,7 +47,7 @@ from tests.loopback.secured import (
 from tests.loopback.test_lease import Ear, Robot
 from tests.ports import free_port
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
 PUBLIC = slice(17, 49)  # of an offer: its key
 

@@ -23,8 +23,8 @@ from site_runtime.session import parse_session
 from site_runtime.session_edit import edited
 from site_runtime.supervisor import State
 
-OPCODES = 7340
-CALLS_INTO_C = 149
+OPCODES = 7312
+CALLS_INTO_C = 147
 ROOM = 1.02
 SETTLE_TICKS = 2500  # engaged, ramps over; two links are near the post
 COUNTED_TICKS = 20

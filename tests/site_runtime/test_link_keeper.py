@@ -1,9 +1,9 @@
-from collections import Counter
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import pytest
 
+from channel.channel import Counters
 from channel.packet import Reject
 from site_runtime.clock import ManualClock
 from site_runtime.daemon_log import DaemonLog
@@ -27,7 +27,7 @@ class Watched:
     opened_s: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.counters = SimpleNamespace(rejected=Counter[Reject]())
+        self.counters = Counters()
         self.requests = OperatorRequests()
         site = SimpleNamespace(channel=self, requests=self.requests)
         self.keeper = LinkKeeper(site, self, self, self.clock, DaemonLog("local"))
@@ -49,7 +49,8 @@ class Watched:
                 self.heard_ns = self.clock.now_ns()
             if speaks and hears:
                 self.echoed_ns = self.clock.now_ns() - S // 10
-            self.counters.rejected[Reject.SESSION] += refused
+            for _ in range(refused):
+                self.counters.reject(Reject.SESSION)
             self.keeper.look()
 
 

@@ -27,7 +27,7 @@ from telemetry.events import Level
 from tests.loopback.secured import LOOPBACK, NAME, make_keys, until, write_session
 from tests.ports import free_port
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.patient
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
 S = 1_000_000_000
 

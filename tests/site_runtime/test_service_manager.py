@@ -148,7 +148,7 @@ def silent(ear: Ear) -> bool:
     return ear.waiting() == []
 
 
-@pytest.mark.processes
+@pytest.mark.patient
 @pytest.mark.parametrize("ear", ["path"], indirect=True)
 def test_a_site_whose_loop_hangs_pings_no_more_though_its_other_threads_live(
     ear: Ear, start
@@ -169,7 +169,7 @@ def test_a_site_whose_loop_hangs_pings_no_more_though_its_other_threads_live(
     assert process.wait(DEADLINE_S) == 0
 
 
-@pytest.mark.processes
+@pytest.mark.patient
 @pytest.mark.parametrize("ear", ["path"], indirect=True)
 def test_a_site_that_cannot_start_is_never_ready(ear: Ear, start, tmp_path: Path) -> None:
     process = start("remote_site", tmp_path / "absent.toml")
@@ -177,7 +177,7 @@ def test_a_site_that_cannot_start_is_never_ready(ear: Ear, start, tmp_path: Path
     assert ear.waiting() == []
 
 
-@pytest.mark.processes
+@pytest.mark.patient
 @pytest.mark.parametrize("ear", ["path"], indirect=True)
 def test_a_suspended_relay_pings_no_more(ear: Ear, start, tmp_path: Path) -> None:
     session = tmp_path / "session.toml"
