@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from typing import Annotated
 
 import typer
@@ -10,11 +10,20 @@ import typer
 from channel.zenoh_link import Subscription, ZenohNode, stock_configuration
 from farhand.console import ERR, user_errors
 from site_runtime.clock import SteadyClock
-from site_runtime.daemon import Duration, Listen, SessionPath, StopSignals, packets_node
+from site_runtime.daemon import (
+    Duration,
+    Listen,
+    Metrics,
+    SessionPath,
+    StopSignals,
+    packets_node,
+)
 from site_runtime.keys import SiteId, state_key
+from site_runtime.metrics import MetricsAddress
 from site_runtime.security.network import meet_as_router
 from site_runtime.service_manager import ServiceManager
 from site_runtime.session import SessionError, load_session
+from telemetry.metrics.relay_metrics import RelayMetrics, served
 
 POLL_S = 0.2
 STATUS_S = 10.0
@@ -25,6 +34,7 @@ def router(
     session: SessionPath,
     listen: Listen = None,
     duration: Duration = None,
+    metrics: Metrics = None,
     print_config: Annotated[
         bool,
         typer.Option("--print-config", help="Print the configuration for a zenohd, and end."),
@@ -53,16 +63,20 @@ def router(
         listens = [*meeting.settings.listen]
         if meeting.packets is not None:
             listens += meeting.packets.listen
+        kept = RelayMetrics(loaded.name)
         with (
             closing(ZenohNode(meeting.settings)) as node,
             packets_node(meeting) as packets,
             closing(ServiceManager()) as manager,
             StopSignals(SteadyClock(), duration) as signals,
+            _served(kept, metrics) as url,
         ):
             _say(
                 f"farhand router · session {loaded.name} · {', '.join(listens)} · "
                 + (meeting.credentials.common_name if meeting.credentials else "no certificates")
             )
+            if url is not None:
+                _say(f"metrics at {url}")
             # not the telemetry, which else would be sent here when nobody looks
             operators = [one.person for one in meeting.people] or [None]
             parties = [*((SiteId.LOCAL, one) for one in operators), (SiteId.REMOTE, None)]
@@ -74,29 +88,40 @@ def router(
                 for site, person in parties
             ]
             manager.ready()
-            _watch(node, heard, signals, manager)
+            _watch(node, heard, signals, manager, kept)
             manager.stopping()
 
 
+def _served(
+    kept: RelayMetrics, address: MetricsAddress | None
+) -> AbstractContextManager[str | None]:
+    return nullcontext() if address is None else served(kept, address.host, address.port)
+
+
 class _Rate:
-    """How many packets a site has sent through since the last status line."""
+    """How many packets a site has sent through, in all and since the last status line."""
 
     def __init__(self, name: str, subscription: Subscription) -> None:
-        self._name = name
+        self.name = name
+        self.count = 0
         self._subscription = subscription
-        self._count = 0
+        self._told = 0
 
     def poll(self) -> None:
-        self._count += len(self._subscription.receive())
+        self.count += len(self._subscription.receive())
 
     def text(self, over_s: float) -> str:
         """Return the rate, and count anew."""
-        rate_hz, self._count = self._count / over_s, 0
-        return f"{self._name} {rate_hz:.0f} packets/s"
+        rate_hz, self._told = (self.count - self._told) / over_s, self.count
+        return f"{self.name} {rate_hz:.0f} packets/s"
 
 
 def _watch(
-    node: ZenohNode, heard: Sequence[_Rate], signals: StopSignals, manager: ServiceManager
+    node: ZenohNode,
+    heard: Sequence[_Rate],
+    signals: StopSignals,
+    manager: ServiceManager,
+    kept: RelayMetrics,
 ) -> None:
     """Say who comes and goes, and now and then how much passes."""
     present: tuple[str, ...] = ()
@@ -111,6 +136,9 @@ def _watch(
         for name in sorted({*present} - {*now}):
             _say(f"{name} gone")
         present = now
+        kept.packets = {rate.name: rate.count for rate in heard}
+        kept.connections = len(present)
+        kept.connected = tuple(name for name in present if "/" not in name)  # others: addresses
         if (over_s := time.monotonic() - since_s) >= STATUS_S:
             since_s += over_s
             rates = ", ".join(rate.text(over_s) for rate in heard)

@@ -22,13 +22,13 @@ class MetricsProcess:
             answer = self._await_answer()
             if "error" in answer:
                 raise TelemetryError(
-                    f"metrics cannot be served on {_joined(options.host, options.port)}: "
+                    f"metrics cannot be served on {joined(options.host, options.port)}: "
                     f"{answer['error']}; name another port, or run without --metrics"
                 )
         except BaseException:
             self._process.kill()
             raise
-        self.url = f"http://{_joined(options.host, answer['port'])}/metrics"
+        self.url = f"http://{joined(options.host, answer['port'])}/metrics"
 
     @property
     def pid(self) -> int:
@@ -69,5 +69,6 @@ class MetricsProcess:
         }
 
 
-def _joined(host: str, port: int) -> str:
+def joined(host: str, port: int) -> str:
+    """Return HOST:PORT, an IPv6 host in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

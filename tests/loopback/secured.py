@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import tomlkit
@@ -121,16 +121,16 @@ class SecuredPair:
         shutil.copytree(self.keys / name, place)
         return place
 
-    def start(self, *names: str) -> None:
-        """Start `local`, `remote`, `router`."""
+    def start(self, *names: str, options: Sequence[str] = ()) -> None:
+        """Start `local`, `remote`, `router`, with options beyond the usual ones."""
         for name in names:
             site = name in ("local", "remote")
             command = [f"{name}_site"] if site else ["farhand", name]
             quietly = ["--quiet", "--no-record"] if site else []
-            options = [str(self.file), "--duration", str(ORPHAN_S), *quietly]
+            usual = [str(self.file), "--duration", str(ORPHAN_S), *quietly]
             with (self.folder / f"{name}.log").open("ab") as log:
                 self._processes[name] = subprocess.Popen(
-                    [sys.executable, "-m", *command, *options],
+                    [sys.executable, "-m", *command, *usual, *options],
                     cwd=ROOT,
                     stdin=subprocess.DEVNULL,
                     stdout=log,

@@ -1,20 +1,25 @@
 """`farhand router`: two daemons that meet at a relay, and those who try through it."""
 
 import json
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.keys import SiteId, state_key
 from site_runtime.link_keeper import ASK_S, UNHEARD_S
 from site_runtime.security.network import meet_as_site
 from tests.loopback.secured import FORGED, NAME, RATE_HZ, ROOT, SecuredPair, tls, until
+from tests.ports import free_port
 
 pytestmark = pytest.mark.patient
 LOCAL, REMOTE = SiteId.LOCAL, SiteId.REMOTE
@@ -27,7 +32,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredPair]:
         # the relay comes last: nobody waits for it to start
         pair.start("remote", "local")
         pair.watch()
-        pair.start("router")
+        pair.start("router", options=("--metrics", "0"))
         pair.until_engaged()
         yield pair
     finally:
@@ -44,6 +49,51 @@ def behind(pair: SecuredPair, name: str, region: str) -> ZenohNode:
 def test_the_relay_tells_who_is_connected(pair: SecuredPair) -> None:
     for name in ("local-1", "remote-1", "observer.dashboard-1"):
         until(lambda name=name: f"{name} connected" in pair.text("router"), f"{name} told of")
+
+
+def scraped(pair: SecuredPair) -> dict[str, dict[tuple[str, ...], float]]:
+    """The relay's own metrics: by name, by the values of their labels but the session's."""
+    url = re.search(r"metrics at (http://127\S+)", pair.text("router"))
+    assert url is not None
+    with urllib.request.urlopen(url[1], timeout=5) as answer:  # noqa: S310 - our own
+        text = answer.read().decode()
+    found: dict[str, dict[tuple[str, ...], float]] = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            assert sample.labels.pop("session") == NAME
+            found.setdefault(sample.name, {})[tuple(sample.labels.values())] = sample.value
+    return found
+
+
+def test_the_relay_counts_what_passes_and_who_is_there(pair: SecuredPair) -> None:
+    names = {("local-1",), ("remote-1",), ("observer.dashboard-1",)}
+    until(lambda: set(scraped(pair)["farhand_relay_connected"]) == names, "all connected")
+    before = scraped(pair)
+    assert before["farhand_relay_connections"] == {(): 3}
+    time.sleep(1.0)
+    after = scraped(pair)["farhand_relay_packets_total"]
+    assert set(after) == {("local",), ("remote",)}
+    for party, count in after.items():
+        passed = count - before["farhand_relay_packets_total"][party]
+        assert 0.3 * RATE_HZ < passed < 3 * RATE_HZ
+
+
+def test_a_relay_whose_metrics_have_no_port_says_so(pair: SecuredPair) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = subprocess.run(
+            [
+                *(sys.executable, "-m", "farhand", "router", str(pair.file)),
+                *("--listen", f"tls/127.0.0.1:{free_port()}", "--metrics", str(port)),
+            ],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert f"metrics cannot be served on 127.0.0.1:{port}" in done.stderr
 
 
 def test_a_site_speaks_through_the_relay_in_its_own_name(pair: SecuredPair) -> None:

@@ -2,7 +2,6 @@
 
 import socket
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from datetime import timedelta
@@ -11,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from channel.packet import Reject
+from channel.channel import Counters
 from channel.sealed_link import Refusal
 from channel.zenoh_link import ZenohNode, ZenohSettings
 from site_runtime.clock import ManualClock
@@ -313,7 +312,7 @@ def test_either_node_s_silence_has_both_opened_anew_but_not_while_others_hold_th
     opened_s: list[float] = []
     monkeypatch.setattr(local.seal, "reopen", lambda: opened_s.append(place.clock.now_ns() / S))
     channel = SimpleNamespace(
-        counters=SimpleNamespace(rejected=Counter[Reject]()),
+        counters=Counters(),
         heard_ns=None,
         echoed_ns=None,
         peer_taken=False,
