@@ -70,6 +70,9 @@ def test_the_relay_counts_what_passes_and_who_is_there(pair: SecuredPair) -> Non
     until(lambda: set(scraped(pair)["farhand_relay_connected"]) == names, "all connected")
     before = scraped(pair)
     assert before["farhand_relay_connections"] == {(): 3}
+    page = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
+    told = set(re.findall(r"^\| `(farhand_relay_\w+)`", page, re.MULTILINE))
+    assert told == {name for name in before if not name.endswith("_created")}
     time.sleep(1.0)
     after = scraped(pair)["farhand_relay_packets_total"]
     assert set(after) == {("local",), ("remote",)}
