@@ -37,6 +37,7 @@ class Keeper(ABC):
     ) -> None:
         self._ended.set()
         self._thread.join(timeout=1.0)
+        self.ended()
 
     @abstractmethod
     def look(self) -> None:
@@ -45,6 +46,9 @@ class Keeper(ABC):
     @abstractmethod
     def look_failed(self) -> None:
         """Bring what is kept to its safe side: nobody knows what it is like now."""
+
+    def ended(self) -> None:  # noqa: B027 - most leave nothing
+        """Do what is left to do once no look comes any more."""
 
     def _watch(self) -> None:
         while not self._ended.wait(self._period_s):

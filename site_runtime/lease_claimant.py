@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Final
 
 from site_runtime.daemon_log import DaemonLog
@@ -46,13 +45,8 @@ class LeaseClaimant(Keeper):
         self._told = ""
         site.requests.unleased = True
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        super().__exit__(kind, error, traceback)
+    def ended(self) -> None:
+        """Give the lease back."""
         release = encode_wish(Wish(Verb.RELEASE, time.time_ns()))
         for _ in range(_FAREWELLS):  # a lost one costs the next operator the time of expiry
             self._publish(release)

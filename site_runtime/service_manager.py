@@ -4,7 +4,6 @@ import os
 import socket
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from types import TracebackType
 from typing import Final
 
 from site_runtime.daemon_log import DaemonLog
@@ -87,11 +86,6 @@ class ServiceKeeper(Keeper):
     def look_failed(self) -> None:
         """Say nothing: a watchdog that hears nothing acts."""
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        super().__exit__(kind, error, traceback)
+    def ended(self) -> None:
+        """Tell that the process is about to end."""
         self._manager.stopping()
